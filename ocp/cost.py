@@ -1,0 +1,91 @@
+"""The running cost L(x, u) = W(x) + u' R u, written once in CasADi.
+
+W(x) = goal Q(x) + (x - x_g)' M (x - x_g) + obstacle sum_k phi_k(x)   (Xu and Zhu, section IV-A)
+
+Q(x)     = max(2 / (1 + exp(-a (|p - p_g|^2 - r_g^2))) - 1, 0) = max(tanh(a (...) / 2), 0)
+phi_k(x) = exp(-b r_k^2 (g_k(p)^2 - 1)),   g_k the gauge of obstacle k
+
+For circles and diamonds phi_k is the paper's exp(-b (|p - c|_m^2 - r^2)) with the 2- and 1-norm.
+Every function takes CasADi symbols or numbers, so that one definition serves IPOPT (constants) and
+the compiled kernels (parameters).
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+Expression = ca.SX | ca.DM
+
+
+@dataclass(frozen=True)
+class RunningCost:
+    """Weights of the running cost; the defaults are the paper's.
+
+    Attributes:
+        input: diagonal of R, one positive weight an input; `None` means all 1.
+        goal: weight of Q.
+        goal_steepness: a, 1/m^2.
+        obstacle: weight of the obstacle penalties.
+        obstacle_steepness: b, 1/m^2.
+        state: M, `n` rows of `n` numbers, symmetric positive semidefinite; `None` means 0.
+            x_g has the goal's centre in its position coordinates and 0 elsewhere.
+    """
+
+    input: tuple[float, ...] | None = None
+    goal: float = 1.0
+    goal_steepness: float = 3.0
+    obstacle: float = 1.0
+    obstacle_steepness: float = 4.0
+    state: tuple[tuple[float, ...], ...] | None = None
+
+    def check(self, n: int, m: int) -> None:
+        """Raise ValueError, naming the field, unless the weights fit `n` states, `m` inputs."""
+        for name in ("goal", "goal_steepness", "obstacle", "obstacle_steepness"):
+            number = getattr(self, name)
+            if not (np.isfinite(number) and number >= 0):
+                raise ValueError(f"cost.{name}: must be a finite number >= 0, got {number}")
+        if self.input is not None and (
+            len(self.input) != m or not all(np.isfinite(w) and w > 0 for w in self.input)
+        ):
+            raise ValueError(
+                f"cost.input: needs {m} positive finite weights, got {list(self.input)}"
+            )
+        if self.state is not None:
+            M = np.array([list(row) for row in self.state], dtype=float)
+            if M.shape != (n, n) or not np.isfinite(M).all() or not np.allclose(M, M.T):
+                raise ValueError(f"cost.state: must be a symmetric {n} x {n} matrix")
+            if np.linalg.eigvalsh(M).min() < -1e-12 * max(1.0, abs(M).max()):
+                raise ValueError("cost.state: must be positive semidefinite")
+
+
+def goal_cost(position: Expression, center: Expression, radius, weight, steepness) -> ca.SX:
+    """goal Q(x): 0 in the goal ball, rising to `weight` far from it."""
+    excess = ca.sumsqr(position - center) - radius**2
+    return weight * ca.fmax(ca.tanh(steepness * excess / 2), 0)
+
+
+def quadratic_cost(state: Expression, reference: Expression, matrix: Expression) -> ca.SX:
+    """(x - x_g)' M (x - x_g)."""
+    return ca.bilin(matrix, state - reference, state - reference)
+
+
+def ball_penalty(position: Expression, center: Expression, radius, weight, steepness) -> ca.SX:
+    """phi of a circle: 1 on its boundary, exp(b r^2) at its centre."""
+    return weight * ca.exp(-steepness * (ca.sumsqr(position - center) - radius**2))
+
+
+def facet_penalty(
+    position: Expression, center: Expression, facet: Expression, radius, weight, steepness
+) -> ca.SX:
+    """phi of a polygon where `facet` (the row a of `Obstacle.facets`) attains the gauge."""
+    gauge = ca.dot(facet, position - center)
+    return weight * ca.exp(-steepness * radius**2 * (gauge**2 - 1))
+
+
+def polygon_penalty(
+    position: Expression, center: Expression, facets: Expression, radius, weight, steepness
+) -> ca.SX:
+    """phi of a polygon with `facets` `[k, 2]`: the gauge is the largest facet's."""
+    gauge = ca.mmax(facets @ (position - center))
+    return weight * ca.exp(-steepness * radius**2 * (gauge**2 - 1))

@@ -1,0 +1,35 @@
+"""The registry of robots. A model added to `MODELS` is met by every law in the tests."""
+
+from collections.abc import Callable
+from functools import cache
+
+from ocp.models.linear import double_integrator, rover, single_integrator, springless_rover
+from ocp.models.unicycle import unicycle
+from ocp.system import System
+
+MODELS: dict[str, Callable[[], System]] = {
+    "unicycle": unicycle,
+    "single-integrator-1d": lambda: single_integrator(1),
+    "single-integrator-2d": lambda: single_integrator(2),
+    "single-integrator-3d": lambda: single_integrator(3),
+    "double-integrator-1d": lambda: double_integrator(1),
+    "double-integrator-2d": lambda: double_integrator(2),
+    "double-integrator-3d": lambda: double_integrator(3),
+    "rover": rover,
+    "springless-rover": springless_rover,
+}
+
+
+@cache
+def get_model(name: str) -> System:
+    """The registered robot `name`.
+
+    Raises:
+        ValueError: if no such robot is registered; the message lists those that are.
+    """
+    if name not in MODELS:
+        raise ValueError(f"model: {name!r} is not registered; known are {', '.join(MODELS)}")
+    return MODELS[name]()
+
+
+__all__ = ["MODELS", "get_model"]
