@@ -1,0 +1,139 @@
+"""Planners and the one driver: refine until a stopping rule holds.
+
+A planner is a start, a step and an answer. A one-shot method is a planner of one step. Stopping
+rules compose with `|` (either ends it) and know nothing of the method.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ocp.query import Query
+from ocp.value import Policy, Value
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a stopping rule may look at."""
+
+    seconds: float
+    iterations: int
+    trajectories: int
+
+
+@dataclass(frozen=True)
+class Until:
+    """A stopping rule."""
+
+    satisfied: Callable[[Progress], bool]
+
+    def __or__(self, other: "Until") -> "Until":
+        return Until(lambda p: self.satisfied(p) or other.satisfied(p))
+
+
+def deadline(seconds: float) -> Until:
+    """Stop once `seconds` have passed since the query was given."""
+    if not seconds > 0:
+        raise ValueError(f"deadline: must be a positive number of seconds, got {seconds}")
+    return Until(lambda p: p.seconds >= seconds)
+
+
+def iterations(count: int) -> Until:
+    """Stop after `count` refinements."""
+    if count < 0:
+        raise ValueError(f"iterations: must not be negative, got {count}")
+    return Until(lambda p: p.iterations >= count)
+
+
+def trajectories(count: int) -> Until:
+    """Stop once the planner has used `count` exact trajectories."""
+    if count < 0:
+        raise ValueError(f"trajectories: must not be negative, got {count}")
+    return Until(lambda p: p.trajectories >= count)
+
+
+class PlannerState(Protocol):
+    """The state of a planner always holds the best valid answer so far."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether another refinement could not improve the answer."""
+        ...
+
+    @property
+    def trajectories(self) -> int:
+        """Exact trajectories used so far."""
+        ...
+
+
+class Planner(Protocol):
+    """A planning method.
+
+    Laws: `start` already gives a state with a valid answer; `refine` never makes it worse by the
+    planner's own measure and does not change its argument.
+    """
+
+    def start(self, query: Query, starts: Sequence[NDArray[np.float64]]) -> Any:
+        """The first state. `starts` are the states that matter; none means the whole space."""
+        ...
+
+    def refine(self, state: Any) -> Any:
+        """A better state."""
+        ...
+
+    def policy(self, state: Any) -> Policy:
+        """The feedback policy of the state."""
+        ...
+
+    def value(self, state: Any) -> Value:
+        """The cost-to-go the policy was read from."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A planner's answer to a query.
+
+    Attributes:
+        query: what was asked.
+        policy: the feedback policy.
+        value: the method's cost-to-go.
+        reaction_time: seconds from the query in memory to the policy ready.
+        trajectories: exact trajectories used.
+    """
+
+    query: Query
+    policy: Policy
+    value: Value
+    reaction_time: float
+    trajectories: int
+
+
+def plan(
+    planner: Planner,
+    query: Query,
+    starts: Sequence[NDArray[np.float64]] = (),
+    until: Until | None = None,
+) -> Plan:
+    """Run `planner` on `query` until the rule holds or nothing more is to be gained.
+
+    Raises:
+        ValueError: if a start does not fit the query.
+        SolveError: if the planner found no answer.
+    """
+    checked = [query.check_start(s) for s in starts]
+    until = until or iterations(8)
+    begun = time.perf_counter()
+    state = planner.start(query, checked)
+    done = 0
+    while not state.finished and not until.satisfied(
+        Progress(time.perf_counter() - begun, done, state.trajectories)
+    ):
+        state = planner.refine(state)
+        done += 1
+    policy, value = planner.policy(state), planner.value(state)
+    return Plan(query, policy, value, time.perf_counter() - begun, state.trajectories)
