@@ -29,7 +29,9 @@ class Plant(LeafSystem):
     def _output(self, context: Context, output: Any) -> None:
         output.SetFromVector(context.get_continuous_state_vector().CopyToVector()[: self._n])
 
-    def DoCalcTimeDerivatives(self, context: Context, derivatives: Any) -> None:
+    def DoCalcTimeDerivatives(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, context: Context, derivatives: Any
+    ) -> None:
         x = context.get_continuous_state_vector().CopyToVector()[: self._n]
         u: Any = self.get_input_port(0).Eval(context)
         rate = np.empty(self._n + 1)
