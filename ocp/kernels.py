@@ -9,13 +9,10 @@ u*_i = clip(-(G' p)_i / (2 R_ii)); the minimised Hamiltonian's flow is x' = dH/d
 """
 
 import importlib
-import os
 import sys
-import tempfile
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -25,6 +22,7 @@ from numpy.typing import NDArray
 
 from ocp import cost as costs
 from ocp.codegen import statements
+from ocp.files import write_text
 from ocp.jit import cache_folder
 from ocp.obstacle import MAX_FACETS
 from ocp.query import Query
@@ -131,11 +129,7 @@ def _load(source: str, label: str) -> ModuleType:
     folder = cache_folder() / "kernels"
     path = folder / f"kernels_of_{label.replace('-', '_')}_{digest}.py"
     if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(source)
-        Path(temporary).replace(path)
+        write_text(path, source)
     sys.path.insert(0, str(folder))  # numba's cache imports the module by name
     try:
         return importlib.import_module(path.stem)

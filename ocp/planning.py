@@ -18,7 +18,13 @@ from ocp.value import Policy, Value
 
 @dataclass(frozen=True)
 class Progress:
-    """What a stopping rule may look at."""
+    """What a stopping rule may look at before the next refinement.
+
+    Attributes:
+        seconds: time spent so far and expected for the next refinement.
+        iterations: refinements done.
+        trajectories: exact trajectories used.
+    """
 
     seconds: float
     iterations: int
@@ -36,7 +42,7 @@ class Until:
 
 
 def deadline(seconds: float) -> Until:
-    """Stop once `seconds` have passed since the query was given."""
+    """Stop rather than begin a refinement that would end more than `seconds` after the query."""
     if not seconds > 0:
         raise ValueError(f"deadline: must be a positive number of seconds, got {seconds}")
     return Until(lambda p: p.seconds >= seconds)
@@ -67,6 +73,11 @@ class PlannerState(Protocol):
     @property
     def trajectories(self) -> int:
         """Exact trajectories used so far."""
+        ...
+
+    @property
+    def next_seconds(self) -> float:
+        """Expected time of the next refinement; 0 if unknown."""
         ...
 
 
@@ -131,7 +142,7 @@ def plan(
     state = planner.start(query, checked)
     done = 0
     while not state.finished and not until.satisfied(
-        Progress(time.perf_counter() - begun, done, state.trajectories)
+        Progress(time.perf_counter() - begun + state.next_seconds, done, state.trajectories)
     ):
         state = planner.refine(state)
         done += 1
