@@ -105,6 +105,38 @@ class Planner(Protocol):
         ...
 
 
+Answer = tuple[Policy, Value]
+
+
+@dataclass(frozen=True)
+class OneShotState:
+    """The answer of a method that has nothing to refine."""
+
+    answer: Answer
+    finished: bool = True
+    trajectories: int = 0
+    next_seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class OneShot:
+    """A method that answers in one step, as a planner."""
+
+    solve: Callable[[Query, Sequence[NDArray[np.float64]]], Answer]
+
+    def start(self, query: Query, starts: Sequence[NDArray[np.float64]]) -> OneShotState:
+        return OneShotState(self.solve(query, starts))
+
+    def refine(self, state: OneShotState) -> OneShotState:
+        return state
+
+    def policy(self, state: OneShotState) -> Policy:
+        return state.answer[0]
+
+    def value(self, state: OneShotState) -> Value:
+        return state.answer[1]
+
+
 @dataclass(frozen=True)
 class Plan:
     """A planner's answer to a query.

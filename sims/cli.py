@@ -1,0 +1,101 @@
+"""The command `zermelo`. Each command is a frozen dataclass; its field docs are its help.
+
+Only what parsing needs is imported here; a command imports its own machinery when it runs.
+Exit status: 0 success, 2 bad input, 3 nothing that was asked could be solved.
+"""
+
+import logging
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from sims.exit_status import BAD_INPUT, BadInputError, reading_input
+
+
+@dataclass(frozen=True)
+class Common:
+    """Options of every command."""
+
+    seed: int = 0
+    """Seed of everything random."""
+    out: Path | None = None
+    """Folder for pictures and data; made if it does not exist."""
+    json: bool = False
+    """Print one JSON document on standard output, and nothing else there."""
+
+    def prepare_out(self) -> None:
+        """Make the output folder, so that a wrong one is refused before any work."""
+        if self.out is not None:
+            with reading_input():
+                self.out.mkdir(parents=True, exist_ok=True)
+                probe = self.out / ".writable"
+                probe.touch()
+                probe.unlink()
+
+
+@dataclass(frozen=True)
+class Plan(Common):
+    """Plan a query: a feedback policy, its closed loops from the starts, the exact optimum beside.
+
+    Example: zermelo plan sims/queries/paper-4-4.toml --start -4 -4 -0.785398
+    """
+
+    query: tyro.conf.Positional[Path] = tyro.MISSING
+    """Query file (TOML)."""
+    start: tyro.conf.UseAppendAction[tuple[tuple[float, ...], ...]] = ()
+    """A start state, all its coordinates; repeat the option for more starts."""
+    method: str = "eikonal"
+    """exact, eikonal or set-valued."""
+    deadline: float | None = None
+    """Seconds until the policy must be ready."""
+    trajectories: int | None = None
+    """Exact trajectories to use at most, for the methods that learn from them."""
+    no_exact: bool = False
+    """Leave out the exact optimum."""
+
+    def run(self) -> int:
+        from sims.plan import run
+
+        return run(self)
+
+
+@dataclass(frozen=True)
+class Demo(Common):
+    """Run a scripted demo, one for each capability."""
+
+    name: tyro.conf.Positional[str] = tyro.MISSING
+    """four-queries: the four queries of Xu and Zhu's Table I."""
+
+    def run(self) -> int:
+        from sims.demos import run
+
+        return run(self)
+
+
+Command = (
+    Annotated[Plan, tyro.conf.subcommand("plan")] | Annotated[Demo, tyro.conf.subcommand("demo")]
+)
+
+
+def main() -> None:
+    """Parse the command line, run the command, exit with its status."""
+    command = tyro.cli(
+        Command,  # pyright: ignore[reportArgumentType]
+        prog="zermelo",
+        description="Near-optimal feedback policies, with the exact optimum beside them.",
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(message)s")
+    try:
+        command.prepare_out()
+        status = command.run()
+    except BadInputError as error:
+        print(f"zermelo: {error}", file=sys.stderr)
+        status = BAD_INPUT
+    except KeyboardInterrupt:
+        print("zermelo: interrupted", file=sys.stderr)
+        status = 130
+    sys.exit(status)

@@ -1,0 +1,116 @@
+"""Scripted demos, one a capability; each leaves a figure."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ocp.files import write_text
+from ocp.query_family import PAPER_FIGURE_STARTS, PAPER_GOALS, PAPER_START, paper_query
+from sims.exit_status import UNSOLVED, reading_input
+from sims.plan import Outcome, number, solve
+
+if TYPE_CHECKING:
+    from sims import cli
+
+PAPER_CLAIMS = {
+    (4.0, 4.0): (24.0, 24.9),
+    (1.0, 1.0): (17.3, 17.9),
+    (1.0, 4.0): (20.1, 20.6),
+    (4.0, 1.0): (20.1, 20.5),
+}
+"""Xu and Zhu, Table I: the benchmark (set-valued, fine grid) and anytime adaptation."""
+
+
+def four_queries(out: Path | None) -> tuple[dict[str, Any], Table, bool]:
+    """The paper's four queries from its seven starts, eikonal method, against the exact optimum.
+
+    Returns the JSON document, a table, and whether every loop reached its goal.
+    """
+    starts = [np.array(s) for s in (PAPER_START, *PAPER_FIGURE_STARTS)]
+    entries, panels = [], []
+    for goal in PAPER_GOALS:
+        query = paper_query(goal)
+        answer, outcomes = solve(query, starts, "eikonal")
+        entries.append(_entry(goal, answer.reaction_time, outcomes))
+        panels.append((answer, outcomes))
+    table = Table(title="Cost from (-4, -4, -pi/4): optimum, ours, and the paper's Table I")
+    for column in (
+        "goal",
+        "exact optimum",
+        "eikonal",
+        "excess",
+        "worst of 7 starts",
+        "reaction",
+        "paper: benchmark",
+        "paper: adaptation",
+    ):
+        table.add_column(column, justify="right")
+    for entry in entries:
+        first = entry["starts"][0]
+        worst = max((s["excess"] for s in entry["starts"] if s["excess"] is not None), default=None)
+        benchmark, adaptation = PAPER_CLAIMS[tuple(entry["goal"])]
+        table.add_row(
+            "({:g}, {:g})".format(*entry["goal"]),
+            number(first["exact_cost"]),
+            number(first["cost"]),
+            number(first["excess"], "{:.3%}"),
+            number(worst, "{:.3%}"),
+            f"{entry['reaction_time_s'] * 1e3:.0f} ms",
+            f"{benchmark:.1f}",
+            f"{adaptation:.1f}",
+        )
+    if out is not None:
+        _four_panels(panels, out)
+    reached = all(s["reached"] for e in entries for s in e["starts"])
+    return {"demo": "four-queries", "queries": entries}, table, reached
+
+
+def _entry(goal: tuple[float, float], reaction: float, outcomes: list[Outcome]) -> dict[str, Any]:
+    return {
+        "goal": list(goal),
+        "reaction_time_s": reaction,
+        "starts": [outcome.report() for outcome in outcomes],
+    }
+
+
+def _four_panels(panels: list, out: Path) -> None:
+    """One panel a query, as the paper's Figure 1."""
+    import matplotlib.pyplot as plt
+
+    from sims.figures import draw_plan, legend, save
+
+    figure, axes = plt.subplots(2, 2, figsize=(10.4, 9.6), layout="constrained")
+    for panel, (answer, outcomes), tag in zip(axes.flat, panels, "abcd", strict=True):
+        loops, optima = [o.rollout for o in outcomes], [o.exact for o in outcomes]
+        draw_plan(panel, answer.query, loops, optima, answer.value)
+        panel.set_title("({}) goal ({:g}, {:g})".format(tag, *answer.query.goal.center))
+    legend(figure)
+    for suffix in (".png", ".svg"):
+        save(figure, out / f"four-queries{suffix}")
+
+
+DEMOS: dict[str, Callable[[Path | None], tuple[dict[str, Any], Table, bool]]] = {
+    "four-queries": four_queries,
+}
+
+
+def run(command: "cli.Demo") -> int:
+    """Run the command; returns its exit status."""
+    with reading_input():
+        if command.name not in DEMOS:
+            raise ValueError(f"demo: {command.name!r} is unknown; known are {', '.join(DEMOS)}")
+    document, table, reached = DEMOS[command.name](command.out)
+    if command.json:
+        print(json.dumps(document))
+    else:
+        Console().print(table)
+        if command.out is not None:
+            Console(stderr=True).print(f"pictures and data: {command.out}")
+    if command.out is not None:
+        write_text(command.out / f"{command.name}.json", json.dumps(document, indent=1) + "\n")
+    return 0 if reached else UNSOLVED

@@ -1,0 +1,213 @@
+"""`zermelo plan`: a policy for a query, its closed loops, and the exact optimum beside them."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from ocp.files import atomic_path, write_text
+from ocp.planning import Plan, deadline, plan, trajectories
+from ocp.query import Query
+from ocp.query_file import query_to_dict
+from ocp.trajectory import SolveError, Trajectory
+from sims.closed_loop import Rollout, rollouts
+from sims.exit_status import UNSOLVED, reading_input
+from sims.methods import METHODS
+
+if TYPE_CHECKING:
+    from sims import cli
+
+notes = Console(stderr=True)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one start.
+
+    Attributes:
+        value: the method's V at the start; infinite or NaN values are not reported.
+        rollout: the closed loop.
+        exact: the exact optimal motion, or `None` where it was not asked for or not established.
+        why_not: why there is no exact motion, if it was asked for.
+    """
+
+    value: float
+    rollout: Rollout
+    exact: Trajectory | None
+    why_not: str | None = None
+
+    @property
+    def excess(self) -> float | None:
+        """Closed-loop cost over the exact optimum, minus 1."""
+        if self.exact is None or self.rollout.cost is None or self.exact.cost == 0:
+            return None
+        return self.rollout.cost / self.exact.cost - 1
+
+    def report(self) -> dict[str, Any]:
+        """The start's entry in the JSON document."""
+        return {
+            "start": self.rollout.start.tolist(),
+            "value": _finite(self.value),
+            "cost": self.rollout.cost,
+            "exact_cost": None if self.exact is None else self.exact.cost,
+            "excess": self.excess,
+            "reached": self.rollout.reached,
+            "collided": self.rollout.collided,
+            "min_clearance": _finite(self.rollout.min_clearance),
+        }
+
+
+def _finite(number: float) -> float | None:
+    return float(number) if np.isfinite(number) else None
+
+
+def solve(
+    query: Query,
+    starts: list[NDArray[np.float64]],
+    method: str,
+    *,
+    seconds: float | None = None,
+    count: int | None = None,
+    with_exact: bool = True,
+) -> tuple[Plan, list[Outcome]]:
+    """Plan, close the loop from every start, and find the exact optimum beside each.
+
+    Raises:
+        SolveError: if the method found no policy.
+    """
+    chosen = METHODS[method]
+    chosen.rehearse(query)
+    until = trajectories(8 if count is None and seconds is None else count or 10**9)
+    if seconds is not None:
+        until = until | deadline(seconds)
+    answer = plan(chosen.make(), query, starts, until)
+    loops = rollouts(answer.policy, starts)
+    outcomes = []
+    with notes.status("exact optimum") as status:
+        for k, (start, loop) in enumerate(zip(starts, loops, strict=True), 1):
+            status.update(f"exact optimum {k} of {len(starts)}")
+            exact, why_not = _exact(query, start) if with_exact else (None, None)
+            value = float(np.asarray(answer.value.value(start)))
+            outcomes.append(Outcome(value, loop, exact, why_not))
+    return answer, outcomes
+
+
+def _exact(query: Query, start: NDArray) -> tuple[Trajectory | None, str | None]:
+    from ocp.pontryagin import exact_trajectory
+
+    try:
+        return exact_trajectory(query, start), None
+    except SolveError as error:
+        return None, str(error)
+
+
+def run(command: "cli.Plan") -> int:
+    """Run the command; returns its exit status."""
+    with reading_input():
+        query = Query.load(command.query)
+        if command.method not in METHODS:
+            known = ", ".join(METHODS)
+            raise ValueError(f"method: {command.method!r} is unknown; known are {known}")
+        if not command.start:
+            raise ValueError("start: give at least one, --start X1 X2 ...")
+        starts = [query.check_start(s) for s in command.start]
+        if command.deadline is not None and not 0 < command.deadline < np.inf:
+            raise ValueError(f"deadline: must be a positive number, got {command.deadline}")
+        if command.trajectories is not None and command.trajectories < 1:
+            raise ValueError(f"trajectories: must be at least 1, got {command.trajectories}")
+    try:
+        answer, outcomes = solve(
+            query,
+            starts,
+            command.method,
+            seconds=command.deadline,
+            count=command.trajectories,
+            with_exact=not command.no_exact,
+        )
+    except SolveError as error:
+        notes.print(f"zermelo: {command.method}: {error}")
+        return UNSOLVED
+    document = {
+        "query": query_to_dict(query),
+        "method": command.method,
+        "reaction_time_s": answer.reaction_time,
+        "trajectories": answer.trajectories,
+        "starts": [outcome.report() for outcome in outcomes],
+    }
+    for outcome in outcomes:
+        if outcome.why_not:
+            notes.print(f"no exact optimum from {outcome.rollout.start}: {outcome.why_not}")
+    if command.json:
+        print(json.dumps(document))
+    else:
+        Console().print(table(answer, command.method, outcomes))
+    if command.out is not None:
+        write_outputs(command.out, document, answer, outcomes)
+    return 0 if any(outcome.rollout.reached for outcome in outcomes) else UNSOLVED
+
+
+def table(answer: Plan, method: str, outcomes: list[Outcome]) -> Table:
+    """The outcomes as a table for the terminal."""
+    result = Table(title=f"{method}: policy ready in {answer.reaction_time * 1e3:.1f} ms")
+    names = [c.name for c in answer.query.system.coordinates]
+    result.add_column(f"start ({', '.join(names)})")
+    for column in ("value", "cost", "exact cost", "excess", "clearance"):
+        result.add_column(column, justify="right")
+    result.add_column("reached")
+    for o in outcomes:
+        report = o.report()
+        result.add_row(
+            ", ".join(f"{x:.3g}" for x in o.rollout.start),
+            number(report["value"]),
+            number(report["cost"]),
+            number(report["exact_cost"]),
+            number(report["excess"], "{:.3%}"),
+            number(report["min_clearance"], "{:.3f} m"),
+            "yes" if o.rollout.reached else "no",
+        )
+    return result
+
+
+def number(value: float | None, form: str = "{:.4f}") -> str:
+    """A number for a table, or a dash where there is none."""
+    return "-" if value is None else form.format(value)
+
+
+def write_outputs(
+    folder: Path, document: dict[str, Any], answer: Plan, outcomes: list[Outcome]
+) -> None:
+    """plan.json, trajectories.npz and, where positions are planar, plan.png into `folder`."""
+    write_text(folder / "plan.json", json.dumps(document, indent=1) + "\n")
+    arrays: dict[str, NDArray] = {}
+    for k, outcome in enumerate(outcomes):
+        for label, motion in (
+            ("closed_loop", outcome.rollout.trajectory),
+            ("exact", outcome.exact),
+        ):
+            if motion is not None:
+                arrays[f"{label}_{k}_times"] = motion.times
+                arrays[f"{label}_{k}_states"] = motion.states
+                arrays[f"{label}_{k}_inputs"] = motion.inputs
+                arrays[f"{label}_{k}_cost_so_far"] = motion.cost_so_far
+    with atomic_path(folder / "trajectories.npz") as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+    if len(answer.query.system.position) == 2:
+        import matplotlib.pyplot as plt
+
+        from sims.figures import draw_plan, legend, save
+
+        figure, axes = plt.subplots(figsize=(6.4, 6.0), layout="constrained")
+        draw_plan(
+            axes,
+            answer.query,
+            [o.rollout for o in outcomes],
+            [o.exact for o in outcomes],
+            answer.value,
+        )
+        legend(figure)
+        save(figure, folder / "plan.png")
