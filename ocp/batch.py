@@ -79,4 +79,4 @@ def _flat(array: ArrayLike, width: int) -> tuple[NDArray[np.float64], tuple[int,
     array = np.asarray(array, dtype=float)
     if array.shape[-1:] != (width,):
         raise ValueError(f"expected {width} numbers on the last axis, got shape {array.shape}")
-    return np.ascontiguousarray(array.reshape(-1, width)), array.shape[:-1]
+    return np.require(array.reshape(-1, width), requirements=["C", "W"]), array.shape[:-1]

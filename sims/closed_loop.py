@@ -106,7 +106,7 @@ def rollouts(
     for k in range(steps):
         if not len(active):
             break
-        inputs = np.ascontiguousarray(policy(rows[active, :-1]))
+        inputs = np.require(policy(rows[active, :-1]), dtype=float, requirements=["C", "W"])
         if not np.isfinite(inputs).all():
             raise FloatingPointError(f"the policy returned a non-finite input at step {k}")
         path = np.empty((len(active), substeps + 1, system.n + 1))
