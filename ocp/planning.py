@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ocp.query import Query
 from ocp.value import Policy, Value
@@ -159,7 +159,7 @@ class Plan:
 def plan(
     planner: Planner,
     query: Query,
-    starts: Sequence[NDArray[np.float64]] = (),
+    starts: Sequence[ArrayLike] = (),
     until: Until | None = None,
 ) -> Plan:
     """Run `planner` on `query` until the rule holds or nothing more is to be gained.
