@@ -75,8 +75,23 @@ class Demo(Common):
         return run(self)
 
 
+@dataclass(frozen=True)
+class Bench(Common):
+    """Measure what the project claims: accuracy, success, time."""
+
+    names: tyro.conf.Positional[tuple[str, ...]] = ()
+    """exact, grids; all of them if none is named."""
+
+    def run(self) -> int:
+        from sims.bench import run
+
+        return run(self)
+
+
 Command = (
-    Annotated[Plan, tyro.conf.subcommand("plan")] | Annotated[Demo, tyro.conf.subcommand("demo")]
+    Annotated[Plan, tyro.conf.subcommand("plan")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
 

@@ -1,0 +1,33 @@
+"""`zermelo bench`: run benchmarks and print what they measured."""
+
+import json
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from ocp.files import write_text
+from sims.benchmarks import BENCHMARKS, machine, run_benchmark
+from sims.exit_status import reading_input
+
+if TYPE_CHECKING:
+    from sims import cli
+
+
+def run(command: "cli.Bench") -> int:
+    """Run the command; returns its exit status."""
+    names = command.names or tuple(BENCHMARKS)
+    with reading_input():
+        for name in names:
+            if name not in BENCHMARKS:
+                raise ValueError(f"bench: {name!r} is unknown; known are {', '.join(BENCHMARKS)}")
+    document = {"machine": machine(), "seed": command.seed, "benchmarks": {}}
+    for name in names:
+        report = run_benchmark(name, command.seed, command.out)
+        document["benchmarks"][name] = report.figures
+        for table in report.tables:
+            Console(stderr=command.json).print(table)
+    if command.json:
+        print(json.dumps(document))
+    if command.out is not None:
+        write_text(command.out / "bench.json", json.dumps(document, indent=1) + "\n")
+    return 0

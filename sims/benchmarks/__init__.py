@@ -1,0 +1,61 @@
+"""Benchmarks by name: what `zermelo bench` runs. Each returns a document and tables."""
+
+import importlib
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+BENCHMARKS: dict[str, str] = {
+    "exact": "exact costs, closed form, success and time of exact trajectories",
+    "grids": "eikonal and set-valued grids: time, value error, closed-loop excess",
+}
+"""Name of the module in this folder, and what it measures."""
+
+
+@dataclass
+class Report:
+    """What a benchmark found.
+
+    Attributes:
+        figures: everything measured, for JSON.
+        tables: the same for reading.
+    """
+
+    figures: dict[str, Any] = field(default_factory=dict)
+    tables: list[Table] = field(default_factory=list)
+
+
+def run_benchmark(name: str, seed: int, out: Path | None) -> Report:
+    """Run one benchmark; pictures go to `out`."""
+    return importlib.import_module(f"sims.benchmarks.{name.replace('-', '_')}").run(seed, out)
+
+
+def median_seconds(task: Callable[[], Any], repeats: int = 5) -> float:
+    """Median wall time of `task` after one run that is not counted."""
+    task()
+    times = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        task()
+        times.append(time.perf_counter() - begun)
+    return float(np.median(times))
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    return {
+        "processor": platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("numpy", "numba", "casadi", "drake")},
+    }
