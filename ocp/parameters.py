@@ -1,0 +1,68 @@
+"""The numbers of a query as one vector, the argument q of every compiled kernel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ocp.obstacle import MAX_FACETS
+from ocp.query import Query
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each number of a query stands in its parameter vector q."""
+
+    n: int
+    m: int
+    d: int
+    quadratic: bool
+    bounded: bool
+
+    @property
+    def goal(self) -> int:
+        return 3 * self.m
+
+    @property
+    def state(self) -> int:
+        return self.goal + self.d + 5
+
+    @property
+    def count(self) -> int:
+        return self.state + (self.n**2 + self.n if self.quadratic else 0)
+
+    @property
+    def stride(self) -> int:
+        return 2 + self.d + (2 * MAX_FACETS if self.d == 2 else 0)
+
+    @classmethod
+    def of(cls, query: Query) -> "Layout":
+        system = query.system
+        return cls(
+            system.n,
+            system.m,
+            len(system.position),
+            query.cost.state is not None,
+            query.is_bounded,
+        )
+
+
+def parameters(query: Query) -> NDArray[np.float64]:
+    """The parameter vector q of a query: input limits and weights, goal, cost, obstacles."""
+    layout = Layout.of(query)
+    w = query.cost
+    head = [
+        query.input_weights,
+        *query.input_bounds,
+        np.array(query.goal.center),
+        [query.goal.radius, w.goal, w.goal_steepness, w.obstacle, w.obstacle_steepness],
+    ]
+    if w.state is not None:
+        head += [query.reference, np.array(w.state).ravel()]
+    records = np.zeros((len(query.obstacles), layout.stride))
+    for record, o in zip(records, query.obstacles, strict=True):
+        facets = o.facets.ravel()
+        record[0], record[1] = len(o.facets), o.radius
+        record[2 : 2 + layout.d] = o.center
+        record[2 + layout.d : 2 + layout.d + len(facets)] = facets
+    return np.concatenate([*head, [len(records)], records.ravel()])
