@@ -66,7 +66,8 @@ def _kernels(system: System, layout: Layout) -> Kernels:
 def _load(source: str, label: str) -> ModuleType:
     digest = sha256(source.encode()).hexdigest()[:24]
     folder = cache_folder() / "kernels"
-    path = folder / f"kernels_of_{re.sub(r'\W', '_', label)}_{digest}.py"
+    stem = re.sub(r"\W", "_", label)
+    path = folder / f"kernels_of_{stem}_{digest}.py"
     if not path.exists():
         write_text(path, source)
     sys.path.insert(0, str(folder))  # numba's cache imports the module by name
