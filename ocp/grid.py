@@ -251,6 +251,33 @@ class GridValue:
         return np.ascontiguousarray(states.reshape(-1, n)), states.shape[:-1]
 
 
+@compiled(
+    types.Tuple((types.int64, types.int64, float64, types.int64))(
+        float64, VECTOR, types.int64, types.int64, types.int64
+    )
+)
+def _locate(x, geometry, axis, n, stride):
+    """Flat offsets of the nodes below and above `x` on an axis, the fraction, the next stride.
+
+    The offset below is -1 outside the box.
+    """
+    count = int(geometry[2 * n + axis])
+    t = (x - geometry[axis]) * geometry[n + axis]
+    if geometry[3 * n + axis] > 0.0:
+        t -= math.floor(t / count) * count
+        if not 0.0 <= t <= count:
+            return -1, -1, 0.0, stride * count
+        low = min(int(t), count - 1)
+        high = low + 1 if low + 1 < count else 0
+    else:
+        if not -EDGE_TOLERANCE <= t <= count - 1 + EDGE_TOLERANCE:
+            return -1, -1, 0.0, stride * count
+        t = min(max(t, 0.0), count - 1.0)
+        low = min(int(t), count - 2)
+        high = low + 1
+    return low * stride, high * stride, t - low, stride * count
+
+
 @compiled(float64(VECTOR, VECTOR, VECTOR))
 def interpolate(values, geometry, point):
     """Multilinear value at `point` `[n]`; infinite outside the box or next to an infinite corner.
@@ -258,37 +285,32 @@ def interpolate(values, geometry, point):
     `values` `[nodes]` and `geometry` `[4n]` are `GridValue.flat` and `Grid.geometry`.
     """
     n = point.shape[0]
-    index = np.zeros(2 * MAX_DIMENSION, dtype=np.int64)
-    weight = np.zeros(2 * MAX_DIMENSION)
-    stride = 1
-    for reverse in range(n):
-        i = n - 1 - reverse
-        count = int(geometry[2 * n + i])
-        t = (point[i] - geometry[i]) * geometry[n + i]
-        if geometry[3 * n + i] > 0.0:
-            t -= math.floor(t / count) * count
-            if not 0.0 <= t <= count:
-                return np.inf
-            low = min(int(t), count - 1)
-            high = low + 1 if low + 1 < count else 0
-        else:
-            if not -EDGE_TOLERANCE <= t <= count - 1 + EDGE_TOLERANCE:
-                return np.inf
-            t = min(max(t, 0.0), count - 1.0)
-            low = min(int(t), count - 2)
-            high = low + 1
-        weight[2 * i], weight[2 * i + 1] = 1.0 - (t - low), t - low
-        index[2 * i], index[2 * i + 1] = low * stride, high * stride
-        stride *= count
     total = 0.0
-    for corner in range(1 << n):
-        w, k = 1.0, 0
-        for i in range(n):
-            side = 2 * i + (corner >> i & 1)
-            w *= weight[side]
-            k += index[side]
-        if w > 0.0:  # 0 times infinity would be NaN
-            total += w * values[k]
+    low3, high3, f3, stride = _locate(point[n - 1], geometry, n - 1, n, 1)
+    low2, high2, f2, low1, high1, f1, low0, high0, f0 = 0, 0, 0.0, 0, 0, 0.0, 0, 0, 0.0
+    if n > 1:
+        low2, high2, f2, stride = _locate(point[n - 2], geometry, n - 2, n, stride)
+    if n > 2:
+        low1, high1, f1, stride = _locate(point[n - 3], geometry, n - 3, n, stride)
+    if n > 3:
+        low0, high0, f0, stride = _locate(point[n - 4], geometry, n - 4, n, stride)
+    if low0 < 0 or low1 < 0 or low2 < 0 or low3 < 0:
+        return np.inf
+    # Corners of weight 0 are skipped: 0 times infinity would be NaN.
+    for s0 in range(2):
+        w0, k0 = (f0, high0) if s0 else (1.0 - f0, low0)
+        if w0 > 0.0:
+            for s1 in range(2):
+                w1, k1 = (f1, high1) if s1 else (1.0 - f1, low1)
+                if w1 > 0.0:
+                    for s2 in range(2):
+                        w2, k2 = (f2, high2) if s2 else (1.0 - f2, low2)
+                        if w2 > 0.0:
+                            k = k0 + k1 + k2
+                            if f3 < 1.0:
+                                total += w0 * w1 * w2 * (1.0 - f3) * values[k + low3]
+                            if f3 > 0.0:
+                                total += w0 * w1 * w2 * f3 * values[k + high3]
     return total
 
 
