@@ -1,7 +1,8 @@
 """Optimal control problems and their exact and convergent solvers."""
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ocp.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ocp.cost import RunningCost
@@ -48,8 +49,4 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Import a name's home when it is first asked for: `import ocp` alone costs nothing."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'ocp' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"ocp.{_HOMES[name]}"), name)
+__getattr__ = lazy_names(__name__, _HOMES)

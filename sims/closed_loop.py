@@ -52,6 +52,17 @@ class Rollout:
         """Whether the robot's ball entered an obstacle, soft ones included."""
         return self.min_clearance < 0
 
+    def plot(self, optimum: Trajectory | None = None) -> Any:
+        """A matplotlib figure of this loop, the optimum dashed beside it if given."""
+        import matplotlib.pyplot as plt
+
+        from sims.figures import draw_plan, legend
+
+        figure, axes = plt.subplots(figsize=(6.4, 6.0), layout="constrained")
+        draw_plan(axes, self.query, [self], [optimum])
+        legend(figure)
+        return figure
+
 
 @dataclass(frozen=True)
 class LoopSettings:
