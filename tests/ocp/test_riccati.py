@@ -85,6 +85,18 @@ def test_differential_solution_agrees_with_the_matrix_exponential_between_steps(
         assert solution.P(t) == pytest.approx(exact, abs=1e-9 * (1 + np.abs(exact).max()))
 
 
+def test_the_solution_of_an_unstable_plant_does_not_drift_over_a_long_horizon():
+    """Integrated as a full matrix, P's skew part would grow like exp(2 * 4 * 10) here."""
+    A = [[0, 0, 1, 0], [0, 0, 0, 1], [0, -1.4, 0, 0], [0, 16.8, 0, 0]]
+    pole = LinearQuadratic(A, [[0], [0], [0.95], [-1.4]], 10 * np.eye(4), [[2.0]])
+    solution = differential_riccati(pole, 0.5 * np.eye(4), 10.0)
+    steps, P = 1000, 0.5 * np.eye(4)
+    for _ in range(steps):
+        P = by_matrix_exponential(pole, P, 10.0 / steps)
+        P = (P + P.T) / 2
+    assert solution.P(0.0) == pytest.approx(P, rel=1e-8, abs=1e-8)
+
+
 def test_differential_solution_starts_at_its_terminal_and_obeys_its_equation():
     terminal = np.array([[2.0, 0.5], [0.5, 1.0]])
     solution = differential_riccati(INTEGRATOR, terminal, 3.0)
