@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from planners.repair_kernels import widest_ways
 from planners.roadmap import Roadmap
 from planners.roadmap_kernels import nodes_within
+from planners.robot_approach import WIDEST
 from planners.world import TOLERANCE
 
 
@@ -52,7 +53,7 @@ def find_blockage(roadmap: Roadmap, root: int, robot: NDArray[np.float64]) -> Bl
         if at_most <= TOLERANCE:
             return Blockage(Barrier.OBSTACLES, 0.0)
         decisive = (roadmap.upper > at_least) & (roadmap.lower < at_most)
-        loose = np.flatnonzero(decisive & (roadmap.upper - roadmap.lower > 2 * TOLERANCE))
+        loose = np.flatnonzero(decisive & (roadmap.upper > roadmap.lower + 2 * TOLERANCE))
         if at_most - at_least <= 4 * TOLERANCE or not (len(loose) or lines.loose):
             return Blockage(Barrier.PADDING, max(at_least, 0.0))
         roadmap.make_exact(loose)
@@ -64,12 +65,7 @@ class _Lines:
 
     def __init__(self, roadmap: Roadmap, robot: NDArray[np.float64]) -> None:
         self._roadmap = roadmap
-        radius = roadmap.radius
-        while True:
-            self.nodes, lengths = nodes_within(roadmap.points, robot, radius)
-            if len(self.nodes) > 4 * len(robot) or len(self.nodes) == len(roadmap.points):
-                break
-            radius *= 2
+        self.nodes, lengths = nodes_within(roadmap.points, robot, WIDEST * roadmap.radius)
         self._points = np.concatenate([robot[None], roadmap.points[self.nodes]])
         k = len(self.nodes)
         self._edges = np.column_stack([np.zeros(k, dtype=np.int64), np.arange(1, k + 1)])
@@ -83,8 +79,7 @@ class _Lines:
 
     @property
     def loose(self) -> bool:
-        wide = self.upper - self.lower > 2 * TOLERANCE
-        return bool((wide & (self.upper > 0)).any())
+        return bool(((self.upper > self.lower + 2 * TOLERANCE) & (self.upper > 0)).any())
 
     def make_exact(self) -> None:
         """Shrink the intervals to no width."""

@@ -6,6 +6,9 @@ from numpy.typing import NDArray
 from planners.roadmap import Roadmap
 from planners.roadmap_kernels import nodes_within
 
+# How many connection radii away the robot looks for a node, when nearer ones are barred.
+WIDEST = 4
+
 
 class Approach:
     """Straight lines from the robot to the nodes around it, certified when they are needed.
@@ -23,11 +26,15 @@ class Approach:
     def move(self, robot: NDArray[np.float64]) -> None:
         """The robot is at `robot` `[d]`."""
         self.robot = robot
+        self._free: set[int] = set()
         self.forget()
 
     def forget(self) -> None:
-        """The world, the padding or the nodes changed: what was known of the lines is void."""
-        self._free: set[int] = set()
+        """The world, the padding or the nodes changed: what was known of the lines is void.
+
+        Nodes whose line was free stay candidates, so that a shrinking radius loses no route.
+        """
+        self._kept, self._free = self._free, set()
         self._refused: set[int] = set()
         self._radius = self._roadmap.radius
         self._look()
@@ -42,7 +49,7 @@ class Approach:
         """Whether the best line is certified free, or no line is left; else repair goes on.
 
         The most promising line is looked at alone; if it is blocked, all others are looked at
-        together. Once none is left, nodes up to four radii away are taken in.
+        together. Once none is left, nodes up to `WIDEST` radii away are taken in.
         """
         node = self.best(cost_to_go)
         if node >= 0:
@@ -52,7 +59,7 @@ class Approach:
                 return True
             self._certify(np.flatnonzero(np.isfinite(self.distance)))
             return False
-        if self._radius > 4 * self._roadmap.radius:
+        if self._radius >= WIDEST * self._roadmap.radius:
             return True
         self._radius *= 2
         self._look()
@@ -75,4 +82,6 @@ class Approach:
         if world.certify(here, here, self._roadmap.padding)[0]:
             nodes, away = nodes_within(points, self.robot, self._radius)
             self.distance[nodes] = away
+            kept = list(self._kept)
+            self.distance[kept] = np.linalg.norm(points[kept] - self.robot, axis=1)
             self.distance[list(self._refused)] = np.inf

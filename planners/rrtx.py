@@ -92,18 +92,28 @@ class TreeView:
 
     Attributes:
         points: `[n, d]`.
+        root: the goal's node.
         parent: `[n]`, -1 at the root and at nodes without a way.
-        cost_to_go: `[n]`, infinite at nodes without a way.
+        cost_to_go: `[n]`, the look-ahead value; infinite at nodes without a way.
+        announced: `[n]`, the cost-to-go the neighbours last heard of (g).
         consistent: `[n]`, whether the node waits for no repair.
-        edges, blocked: `[m, 2]`, `[m]`, the whole graph.
+        edges, lengths, blocked: `[m, 2]`, `[m]`, `[m]`, the whole graph; the first of an edge's
+            ends is the older.
+        clearance: `[m]`, at least so far from every obstacle; infinite beyond the horizon.
+        radius: the connection radius, metres.
     """
 
     points: NDArray[np.float64]
+    root: int
     parent: NDArray[np.int32]
     cost_to_go: NDArray[np.float64]
+    announced: NDArray[np.float64]
     consistent: NDArray[np.bool_]
     edges: NDArray[np.int64]
+    lengths: NDArray[np.float64]
     blocked: NDArray[np.bool_]
+    clearance: NDArray[np.float64]
+    radius: float
 
 
 class RRTX:
@@ -358,11 +368,16 @@ class RRTX:
         tree, roadmap = self._tree, self._roadmap
         return TreeView(
             roadmap.points.copy(),
+            tree.root,
             tree.parent.copy(),
             tree.lmc.copy(),
+            tree.g.copy(),
             tree.consistent,
             roadmap.edges.copy(),
+            roadmap.lengths.copy(),
             roadmap.blocked.copy(),
+            roadmap.lower.copy(),
+            roadmap.radius,
         )
 
     def _grow(self, count: int, to_the_end: bool, begun: float) -> Update:

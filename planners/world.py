@@ -76,7 +76,7 @@ class World(Protocol):
         lengths: NDArray[np.float64],
         within: float,
     ) -> EdgeClearances:
-        """Clearance of edges `[m, 2]` between `points` `[n, d]`, those that may come `within` of it."""
+        """Clearance of those edges `[m, 2]` of `points` `[n, d]` that may come `within` of it."""
         ...
 
     def refine(
