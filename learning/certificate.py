@@ -1,24 +1,31 @@
-"""When may a plant be called learned? Rank, condition and a claim of the gain's error."""
+"""When may a plant be called learned? Rank, condition and a claim of the gain's error.
+
+Rank and condition are taken in the coordinates in which the visited states are white (their second
+moments form the identity), columns scaled to unit length. They then measure the excitation itself:
+units, and states that move together, no longer count against it. On ten correlated states this is
+worth three to four orders of magnitude.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from learning.learned_regulator import LearnedRegulator, solve_backward
+from learning.learned_regulator import LearnedRegulator, matrices, solve_backward
 from learning.quadratic_cost import QuadraticCost
 from learning.window_regression import WindowRegression
 from ocp.trajectory import SolveError
 
 Array = NDArray[np.float64]
 
+NOT_MOVED = 1e-7
 DRAWS = 8
 GRID = 51
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """How well the data determine the unknowns, their columns scaled to unit length.
+    """How well the data determine the unknowns, in white coordinates.
 
     Attributes:
         rank: singular values above 1/`largest_condition` of the largest.
@@ -53,19 +60,27 @@ class Certificate:
     reason: str
 
 
+@dataclass(frozen=True, eq=False)
+class _System:
+    """The triangular system in white, scaled columns: factor `[p, p]` = triangle @ change."""
+
+    factor: Array
+    change: Array
+
+    def solve(self, right: Array) -> Array:
+        """The unknowns of the original columns, `[..., p, k]`, for `right` `[..., p, k]`."""
+        return self.change @ np.linalg.solve(self.factor, right)
+
+    def excitation(self, rows: int, largest_condition: float) -> Excitation:
+        values = np.linalg.svd(self.factor, compute_uv=False)
+        rank = int((values * largest_condition > values[0]).sum()) if values[0] > 0 else 0
+        condition = float(values[0] / values[-1]) if values[-1] > 0 else np.inf
+        return Excitation(rank, len(values), condition, rows)
+
+
 def measure_excitation(data: WindowRegression, largest_condition: float) -> Excitation:
     """Rank and condition of the regressors absorbed so far."""
-    scaled, _ = _scaled(data)
-    values = np.linalg.svd(scaled, compute_uv=False)
-    rank = int((values * largest_condition > values[0]).sum()) if values[0] > 0 else 0
-    condition = float(values[0] / values[-1]) if values[-1] > 0 else np.inf
-    return Excitation(rank, data.p, condition, data.rows)
-
-
-def learned_map(data: WindowRegression) -> Array:
-    """Theta `[p, q]`, the least-squares solution; the rank must be full."""
-    scaled, lengths = _scaled(data)
-    return np.linalg.solve(scaled, data.rotated[:, : data.q]) / lengths[:, None]
+    return _white(data).excitation(data.rows, largest_condition)
 
 
 def certify(
@@ -77,7 +92,8 @@ def certify(
     seed: int = 0,
 ) -> tuple[Certificate, LearnedRegulator | None]:
     """The certificate of the data, and the regulator learned from them if one could be computed."""
-    excitation = measure_excitation(data, largest_condition)
+    system = _white(data)
+    excitation = system.excitation(data.rows, largest_condition)
 
     def short(reason: str) -> Certificate:
         return Certificate(excitation, np.inf, False, reason)
@@ -90,7 +106,7 @@ def certify(
         ), None
     spare = data.effective_rows - data.p
     needed = max(4, data.p // 8)
-    theta = learned_map(data)
+    theta = system.solve(data.rotated[:, : data.q])
     try:
         regulator = solve_backward(cost, theta, affine)
     except SolveError as error:
@@ -100,7 +116,7 @@ def certify(
             f"{data.rows} windows for {data.p} unknowns: at least {data.p + needed} are needed "
             "to judge the fit"
         ), regulator
-    claim = _claimed_error(data, regulator, excitation.condition, spare, seed)
+    claim = _claimed_error(data, system, regulator, excitation.condition, spare, seed)
     if not claim <= accuracy:
         return Certificate(
             excitation,
@@ -117,9 +133,13 @@ def relative_gain_error(gains: Array, reference: Array) -> float:
 
 
 def _claimed_error(
-    data: WindowRegression, regulator: LearnedRegulator, condition: float, spare: float, seed: int
+    data: WindowRegression,
+    system: _System,
+    regulator: LearnedRegulator,
+    condition: float,
+    spare: float,
+    seed: int,
 ) -> float:
-    scaled, lengths = _scaled(data)
     cost, theta, affine = regulator.cost, regulator.theta, regulator.affine
     times = np.linspace(0.0, cost.horizon, GRID)
     reference = regulator.gain(times)
@@ -128,13 +148,15 @@ def _claimed_error(
         other = solve_backward(cost, perturbed, affine, tolerance=1e-8)
         return relative_gain_error(other.gain(times), reference)
 
-    # Measurement noise enters at a window's two ends; overlapping windows share none of them until
-    # one begins where another ends, so the residuals' covariance stands as it is.
-    values, vectors = np.linalg.eigh(data.residual / spare)
+    # Measurement noise at a window's ends is its own, noise in its integrals is shared by all the
+    # windows that overlap it. The variance to use lies between 1 and `window` times the residuals';
+    # the geometric mean is taken.
+    covariance = data.residual * np.sqrt(data.window) / spare
+    values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     noise = np.random.default_rng(seed).standard_normal((DRAWS, data.p, data.q)) @ root.T
-    errors = np.linalg.solve(scaled, noise) / lengths[:, None]
-    rules = np.linalg.solve(scaled, data.rotated[:, data.q :] @ theta) / lengths[:, None]
+    errors = system.solve(noise)
+    rules = system.solve(data.rotated[:, data.q :] @ theta)
     try:
         sampling = change(theta + rules)
         spread = np.array([change(theta + e) for e in errors])
@@ -144,8 +166,29 @@ def _claimed_error(
     return float(np.sqrt(np.mean(spread**2) + sampling**2 + rounding**2))
 
 
-def _scaled(data: WindowRegression) -> tuple[Array, Array]:
-    """The triangular factor with columns of unit length, and their lengths (1 where zero)."""
-    lengths = np.linalg.norm(data.triangle, axis=0)
-    lengths = np.where(lengths > 0, lengths, 1.0)
-    return data.triangle / lengths, lengths
+def _white(data: WindowRegression) -> _System:
+    n, m, q = data.n, data.m, data.q
+    second = matrices(data.moments * np.where(_is_diagonal(n), 1.0, 2.0), n)
+    size = np.sqrt(np.diag(second))
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(second / np.outer(size, size))
+    # A direction that the states never took is left zero, for the rank to show.
+    seen = values > NOT_MOVED**2 * values[-1]
+    inverse_root = np.where(seen, 1.0 / np.sqrt(np.where(seen, values, 1.0)), 0.0)
+    whitening = inverse_root[:, None] * vectors.T / size
+    rows, columns = np.triu_indices(n)
+    pairs = np.einsum("ai,bj->abij", whitening, whitening)[rows, columns]
+    pairs = (pairs + pairs.transpose(0, 2, 1))[:, rows, columns]
+    change = np.zeros((data.p, data.p))
+    change[:q, :q] = np.where(_is_diagonal(n), 0.5, 1.0)[:, None] * pairs.T
+    for k in range(m):
+        block = slice(q + k * n, q + (k + 1) * n)
+        change[block, block] = whitening.T
+    lengths = np.linalg.norm(data.triangle @ change, axis=0)
+    change /= np.where(lengths > 0, lengths, 1.0)
+    return _System(data.triangle @ change, change)
+
+
+def _is_diagonal(n: int) -> NDArray[np.bool_]:
+    rows, columns = np.triu_indices(n)
+    return rows == columns

@@ -31,6 +31,7 @@ from learning.quadratic_cost import QuadraticCost
 
 Array = NDArray[np.float64]
 
+ROUNDING = 1e-14
 DIVERGED = 1e9
 """A weight beyond this counts as diverged; the optimal ones are of order 100 on plants here."""
 
@@ -134,8 +135,17 @@ class PaperLaw(ABC):
         return gain_bound(self.cost, self.Q_xu(self.clock), value, self.settings.actor_gain)
 
     def excitation(self) -> float:
-        """beta of Lemma 4.2: least eigenvalue of the integral of Delta Delta' since the start."""
-        return float(max(0.0, np.linalg.eigvalsh(self._excitation)[0]))
+        """beta of Lemma 4.2: least eigenvalue of the integral of Delta Delta' since the start.
+
+        Zero where it cannot be told from the rounding of the largest.
+        """
+        values = np.linalg.eigvalsh(self._excitation)
+        return float(values[0]) if values[0] > ROUNDING * values[-1] else 0.0
+
+    def excited_rank(self) -> int:
+        """Eigenvalues of that integral above the largest one's rounding; len(critic) are needed."""
+        values = np.linalg.eigvalsh(self._excitation)
+        return int((values > ROUNDING * values[-1]).sum()) if values[-1] > 0 else 0
 
     def new_leg(self) -> None:
         """The state jumps to the next waypoint's error coordinates: differences across are void."""

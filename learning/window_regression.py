@@ -19,12 +19,13 @@ which reaches 1e7 in use.
 """
 
 from functools import cache
+from time import thread_time
 
 import numpy as np
 from numba import float64, int64, njit, types
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.jit import MATRIX, compiled
+from ocp.jit import MATRIX, VECTOR, compiled
 
 Array = NDArray[np.float64]
 
@@ -123,6 +124,7 @@ def _rotate_in(triangle, rotated, residual, row, right):
         float64[:, :, ::1],
         MATRIX,
         int64[::1],
+        VECTOR,
         MATRIX,
         MATRIX,
         MATRIX,
@@ -137,6 +139,7 @@ def _absorb(
     integrals,
     ends,
     counters,
+    moments,
     triangle,
     rotated,
     residual,
@@ -152,6 +155,8 @@ def _absorb(
         piece = samples[k * substeps : (k + 1) * substeps + 1]
         head = counters[HEAD]
         _hold_integrals(piece, inputs[k], weights, step, z, integrals[head % window])
+        for i in range(q):
+            moments[i] = memory * moments[i] + integrals[head % window, 0, i]
         _monomials(piece[substeps], ends[(head + 1) % (window + 1)])
         counters[HEAD] = head + 1
         counters[FILLED] = min(counters[FILLED] + 1, window)
@@ -185,6 +190,7 @@ class WindowRegression:
         rotated: `[p, q + p]`, in the same rotated frame the changes of z (first q columns) and the
             difference between the two quadrature rules.
         residual: `[q, q]`, the sum of outer products of the rows' residuals.
+        moments: `[q]`, the integrals of x_i x_j (i <= j) over all that was absorbed.
     """
 
     def __init__(
@@ -198,6 +204,7 @@ class WindowRegression:
         self.triangle = np.zeros((self.p, self.p))
         self.rotated = np.zeros((self.p, self.q + self.p))
         self.residual = np.zeros((self.q, self.q))
+        self.moments = np.zeros(self.q)
         self._weights = quadrature(substeps)
         self._integrals = np.zeros((window, 2, self.p))
         self._ends = np.zeros((window + 1, self.q))
@@ -215,11 +222,11 @@ class WindowRegression:
             return float(self.rows)
         return (1.0 - self.memory**self.rows) / (1.0 - self.memory)
 
-    def absorb(self, samples: ArrayLike, inputs: ArrayLike) -> None:
+    def absorb(self, samples: ArrayLike, inputs: ArrayLike) -> float:
         """Take in states `[k * substeps + 1, n]` while each of the inputs `[k, m]` was held.
 
         Continues the motion absorbed before (the first state is the last one again) unless
-        `interrupt` was called in between.
+        `interrupt` was called in between. Returns the CPU seconds that the compiled update took.
 
         Raises:
             ValueError: if the shapes do not fit or a number is not finite.
@@ -233,6 +240,7 @@ class WindowRegression:
             raise ValueError(f"samples: must have shape {wanted}, got {states.shape}")
         if not (np.isfinite(states).all() and np.isfinite(held).all()):
             raise ValueError("samples, inputs: numbers must be finite")
+        begun = thread_time()
         _absorb(
             states,
             held,
@@ -242,10 +250,12 @@ class WindowRegression:
             self._integrals,
             self._ends,
             self._counters,
+            self.moments,
             self.triangle,
             self.rotated,
             self.residual,
         )
+        return thread_time() - begun
 
     def interrupt(self) -> None:
         """The motion jumps (a new waypoint, a lost sample): drop the windows that would span it."""
