@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from ocp.function_address import ADDRESSES, addresses, function_at
 from ocp.grid import INTERPOLATION, Grid, interpolate
 from ocp.hard_obstacles import SEGMENT, clear_segment, hard_data, interpolate_visible
+from ocp.input_samples import sampled_inputs
 from ocp.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled, float64
 from ocp.kernels import kernels
+from ocp.parameters import parameters
 from ocp.query import Query
 
 # The type of `bellman`
@@ -61,6 +63,24 @@ def bellman_settings(
 def bellman_geometry(query: Query, grid: Grid, margin: float = 0.0) -> NDArray[np.float64]:
     """The grid's geometry followed by the hard obstacles."""
     return np.concatenate([grid.geometry, hard_data(query, margin)])
+
+
+def arrival_costs(
+    query: Query, grid: Grid, states: NDArray[np.float64], cells: float
+) -> NDArray[np.float64]:
+    """Least cost `[k]` to enter the goal ball from `states` `[k, n]` in one step.
+
+    Infinite where no single step of `cells` cells enters it: the value is at most this.
+    """
+    candidates, spread = sampled_inputs(query)
+    out = np.empty(len(states))
+    nowhere = np.full(grid.size, np.inf)
+    _bellman_rows(
+        np.ascontiguousarray(states), candidates, spread, 2, bellman_addresses(query),
+        parameters(query), bellman_settings(query, cells), nowhere, bellman_geometry(query, grid),
+        out,
+    )  # fmt: skip
+    return out
 
 
 @compiled(float64(float64, float64, float64, float64))
@@ -248,3 +268,22 @@ def bellman(x, u, candidates, spread, rounds, functions, q, settings, values, ge
         shrink *= SHRINK
     u[:] = chosen
     return best
+
+
+@compiled(
+    types.void(
+        MATRIX, MATRIX, VECTOR, types.int64, ADDRESSES, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR
+    )
+)
+def _bellman_rows(
+    states, candidates, spread, rounds, functions, q, settings, values, geometry, out
+):
+    n, m = states.shape[1], candidates.shape[1]
+    scratch = np.empty((SCRATCH_ROWS, max(n, m)))
+    u = np.empty(m)
+    for row in range(states.shape[0]):
+        u[:] = np.nan
+        out[row] = bellman(
+            states[row], u, candidates, spread, rounds, functions, q, settings, values, geometry,
+            scratch,
+        )  # fmt: skip

@@ -4,13 +4,13 @@
 [d, robot radius, count], then for each obstacle [k, centre `[d]`, radius, k vertices `[2]`], with
 k = 0 for a ball. The geometry is that of `Obstacle.signed_distance`, compiled.
 
-A grid sees an obstacle through its edges: two nodes whose positions are at most one cell apart
-along every axis are joined if the straight segment between them is clear of hard obstacles. A
-scheme that mixes only joined nodes cannot leak through an obstacle, however thin.
+A grid sees an obstacle through moves between its nodes: a node may use another's value only if the
+straight segment between their positions is clear of hard obstacles. Then a value is passed on along
+clear segments alone, and cannot leak through an obstacle, however thin. Gaps narrower than a cell
+may be closed.
 """
 
 import math
-from itertools import product
 
 import numpy as np
 from numba import types
@@ -24,6 +24,7 @@ from ocp.query import Query
 SEGMENT = types.FunctionType(float64(VECTOR, VECTOR, VECTOR))
 
 MAX_ADVANCES = 64
+MAX_MOVES = 62
 
 
 def hard_data(query: Query, margin: float = 0.0) -> NDArray[np.float64]:
@@ -156,29 +157,28 @@ def interpolate_visible(values, geometry, point):
     return total / weights if weights > 0.0 else np.inf
 
 
-def blocked_moves(query: Query, grid: Grid) -> NDArray[np.int64]:
-    """Which moves between neighbouring positions of the grid a hard obstacle blocks.
+def blocked_moves(query: Query, grid: Grid, moves: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which short moves from the grid's positions a hard obstacle blocks.
+
+    Args:
+        query: has the hard obstacles, and the robot's radius.
+        grid: its first axes are the position.
+        moves: `[k, d]`, k <= 62, in cells.
 
     Returns:
-        `[*position shape]` bit masks: the bit `move_bit(offset)` is set if the straight segment
-        from that position to the one `offset` (-1, 0 or 1 along each axis) away is not clear.
+        `[*position shape]` bit masks: bit k is set if the straight segment from that position to
+        the one `moves[k]` away is not clear. All are set inside an obstacle.
     """
     d = len(query.system.position)
     shape = grid.shape[:d]
+    if len(moves) > MAX_MOVES:
+        raise ValueError(f"moves: at most {MAX_MOVES} fit a bit mask, got {len(moves)}")
     out = np.zeros(int(np.prod(shape)), dtype=np.int64)
     if query.hard_obstacles:
         nodes = np.stack(np.meshgrid(*grid.axes[:d], indexing="ij"), axis=-1).reshape(-1, d)
-        offsets = np.array(list(product((-1, 0, 1), repeat=d))) * grid.spacing[:d]
+        offsets = np.ascontiguousarray(moves * grid.spacing[:d])
         _blocked(np.ascontiguousarray(nodes), offsets, hard_data(query), out)
     return out.reshape(shape)
-
-
-def move_bit(offset: tuple[int, ...]) -> int:
-    """The bit of `blocked_moves` for a move by `offset`."""
-    bit = 0
-    for o in offset:
-        bit = 3 * bit + o + 1
-    return bit
 
 
 @compiled(types.void(MATRIX, MATRIX, VECTOR, types.Array(types.int64, 1, "C")))

@@ -7,7 +7,6 @@ is not quantised.
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 from numba import types
@@ -22,48 +21,15 @@ from ocp.bellman import (
 )
 from ocp.function_address import ADDRESSES, function_at
 from ocp.grid import GridValue
+from ocp.input_samples import sampled_inputs
 from ocp.jit import MATRIX, SCALAR, VECTOR, compiled
 from ocp.parameters import parameters
 from ocp.query import Query
 
 CELLS = 1.0  # length of the lookahead; between 0.7 and 1.5 the closed loop's cost hardly changes
 ROUNDS = 3  # of refinement
-DIRECTIONS = 16  # sampled on a circle of inputs
 
 scalar_at = function_at(SCALAR)
-
-
-def unit_directions(m: int, count: int = DIRECTIONS) -> NDArray[np.float64]:
-    """Unit vectors `[k, m]` spread over the sphere: two, `count` in the plane, else 3^m - 1."""
-    if m == 2:
-        angles = 2 * np.pi * np.arange(count) / count
-        return np.column_stack([np.cos(angles), np.sin(angles)])
-    corners = np.array([c for c in product((-1.0, 0.0, 1.0), repeat=m) if any(c)])
-    return corners / np.linalg.norm(corners, axis=1, keepdims=True)
-
-
-def sampled_inputs(query: Query) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Inputs to try `[k, m]`, and how far refinement looks to their sides, `[m]`.
-
-    For a time-free query: on u' R u = 1. Otherwise 0 and rays of geometric sizes, clipped to the
-    bounds; an unbounded input is sampled around sqrt(weight of the goal cost / R).
-    """
-    weights = query.input_weights
-    m = len(weights)
-    directions = unit_directions(m)
-    if query.is_time_free:
-        gap = 2 * np.pi / DIRECTIONS if m == 2 else 0.6
-        return np.ascontiguousarray(directions / np.sqrt(weights)), np.full(m, gap)
-    lower, upper = query.input_bounds
-    scale = np.sqrt(max(query.cost.goal, 1e-6) / weights)
-    reach = np.maximum(abs(lower), abs(upper))
-    bounded = np.isfinite(reach)
-    largest = np.where(bounded, reach, 16 * scale)
-    rays = [directions * largest * 2.0**-k for k in range(7)]
-    # Scaled so that rays between two axes reach the corner of the bounds.
-    rays.append(directions / abs(directions).max(axis=1, keepdims=True) * largest)
-    inputs = np.clip(np.concatenate([np.zeros((1, m)), *rays]), lower, upper)
-    return np.unique(inputs, axis=0), largest * 2.0**-7
 
 
 @dataclass(frozen=True, eq=False)
