@@ -41,23 +41,35 @@ class Blockage:
 def find_blockage(roadmap: Roadmap, root: int, robot: NDArray[np.float64]) -> Blockage:
     """The widest way from `robot` `[d]` to the node `root`.
 
-    Only edges whose uncertain clearance could decide are measured exactly. Refines the roadmap's
-    intervals; changes nothing else.
+    The way that is widest by the upper bounds of the clearances is measured, until it stays the
+    widest; other edges are left as they are.
     """
     lines = _Lines(roadmap, robot)
     owner = np.empty(len(roadmap.slot), dtype=np.int64)
     owner[roadmap.slot] = np.repeat(np.arange(len(roadmap.edges)), 2)
+    narrow = roadmap.world.resolution + TOLERANCE
     while True:
-        at_least = _width(roadmap, owner, root, roadmap.lower, lines, lines.lower)
-        at_most = _width(roadmap, owner, root, roadmap.upper, lines, lines.upper)
-        if at_most <= TOLERANCE:
+        width, successor, along = widest_ways(
+            roadmap.start, roadmap.into, roadmap.target, roadmap.upper, owner, root
+        )
+        through = np.minimum(width[lines.nodes], lines.upper)
+        at_most = float(through.max(initial=-np.inf))
+        if at_most <= narrow:
             return Blockage(Barrier.OBSTACLES, 0.0)
-        decisive = (roadmap.upper > at_least) & (roadmap.lower < at_most)
-        loose = np.flatnonzero(decisive & (roadmap.upper > roadmap.lower + 2 * TOLERANCE))
-        if at_most - at_least <= 4 * TOLERANCE or not (len(loose) or lines.loose):
+        line = int(np.argmax(through))
+        edges = []
+        node = int(lines.nodes[line])
+        while successor[node] >= 0:
+            edges.append(int(along[node]))
+            node = int(successor[node])
+        way = np.array(edges, dtype=np.int64)
+        at_least = min(float(roadmap.lower[way].min(initial=np.inf)), float(lines.lower[line]))
+        if at_least >= at_most - narrow:
             return Blockage(Barrier.PADDING, max(at_least, 0.0))
-        roadmap.make_exact(loose)
-        lines.make_exact()
+        loose = way[roadmap.lower[way] < at_most - narrow]
+        roadmap.make_exact(loose[roadmap.upper[loose] > roadmap.lower[loose] + narrow])
+        if lines.upper[line] > lines.lower[line] + narrow:
+            lines.make_exact(line)
 
 
 class _Lines:
@@ -70,37 +82,25 @@ class _Lines:
         k = len(self.nodes)
         self._edges = np.column_stack([np.zeros(k, dtype=np.int64), np.arange(1, k + 1)])
         self.lower, self.upper = np.full(k, np.inf), np.full(k, np.inf)
+        self._known = np.full(k, np.inf)
+        self._loose: list[list[int]] = [[] for _ in range(k)]
         for handle in roadmap.world.handles:
             near = roadmap.world.edge_clearances(
                 handle, self._points, self._edges, lengths, roadmap.horizon
             )
             self.lower[near.index] = np.minimum(self.lower[near.index], near.lower)
             self.upper[near.index] = np.minimum(self.upper[near.index], near.upper)
+            loose = near.upper > near.lower
+            known = near.index[~loose]
+            self._known[known] = np.minimum(self._known[known], near.upper[~loose])
+            for line in near.index[loose]:
+                self._loose[line].append(handle)
 
-    @property
-    def loose(self) -> bool:
-        return bool(((self.upper > self.lower + 2 * TOLERANCE) & (self.upper > 0)).any())
-
-    def make_exact(self) -> None:
-        """Shrink the intervals to no width."""
-        starts, ends = self._points[self._edges[:, 0]], self._points[self._edges[:, 1]]
-        self.lower[:], self.upper[:] = np.inf, np.inf
-        for handle in self._roadmap.world.handles:
-            low, high = self._roadmap.world.refine(handle, starts, ends, None)
-            np.minimum(self.lower, low, out=self.lower)
-            np.minimum(self.upper, high, out=self.upper)
-
-
-def _width(
-    roadmap: Roadmap,
-    owner: NDArray[np.int64],
-    root: int,
-    clearance: NDArray[np.float64],
-    lines: _Lines,
-    reach: NDArray[np.float64],
-) -> float:
-    """Width of the robot's widest way; infinite beyond the horizon."""
-    width, _ = widest_ways(
-        roadmap.start, roadmap.into, roadmap.target, clearance, owner, root, np.full(1, np.inf)
-    )
-    return float(np.minimum(width[lines.nodes], reach).max(initial=-np.inf))
+    def make_exact(self, line: int) -> None:
+        """Shrink the interval of one line to the world's resolution."""
+        start, end = self._points[:1], self._points[line + 1][None]
+        bounds = [
+            self._roadmap.world.refine(handle, start, end, None) for handle in self._loose[line]
+        ]
+        self.lower[line] = min(self._known[line], *(low[0] for low, _ in bounds))
+        self.upper[line] = min(self._known[line], *(high[0] for _, high in bounds))

@@ -290,8 +290,8 @@ def cascade(
     return done, robot
 
 
-@compiled(types.Tuple((VECTOR, NODES))(INDEX, INDEX, NODES, VECTOR, INDEX, int64, VECTOR))
-def widest_ways(start, into, target, clearance, owner, root, ends):
+@compiled(types.Tuple((VECTOR, NODES, INDEX))(INDEX, INDEX, NODES, VECTOR, INDEX, int64))
+def widest_ways(start, into, target, clearance, owner, root):
     """The way from every node to `root` whose least clearance is largest.
 
     Dijkstra's algorithm on max-min in place of min-plus.
@@ -299,19 +299,20 @@ def widest_ways(start, into, target, clearance, owner, root, ends):
     Args:
         clearance: `[m]` of each edge.
         owner: `[2 m]`, the edge of each half-edge.
-        ends: `[1]`, clearance at the root itself.
 
     Returns:
-        the width `[n]` of each node's widest way, and its next node (-1 at the root).
+        the width `[n]` of each node's widest way, its next node (-1 at the root), and the edge to
+        it (-1 likewise).
     """
     n = start.shape[0] - 1
     key = np.full(n, np.inf)
     successor = np.full(n, -1, dtype=np.int32)
+    along = np.full(n, -1, dtype=np.int64)
     heap = np.empty(n, dtype=np.int32)
     place = np.full(n, -1, dtype=np.int32)
     final = np.zeros(n, dtype=np.bool_)
     size = np.zeros(1, dtype=np.int64)
-    key[root] = -ends[0]
+    key[root] = -np.inf
     _push(heap, place, size, key, root)
     while size[0] > 0:
         node = heap[0]
@@ -323,5 +324,6 @@ def widest_ways(start, into, target, clearance, owner, root, ends):
             if not final[u] and width < key[u]:
                 key[u] = width
                 successor[u] = node
+                along[u] = owner[s]
                 _push(heap, place, size, key, u)
-    return -key, successor
+    return -key, successor, along

@@ -154,7 +154,7 @@ class Roadmap:
         )
 
     def make_exact(self, index: NDArray[np.int64]) -> None:
-        """Shrink the clearance intervals of these edges to no width."""
+        """Shrink the clearance intervals of these edges to the world's resolution."""
         self._refine(index, None)
 
     def _clearances(self, handle: int) -> EdgeClearances:
@@ -165,6 +165,8 @@ class Roadmap:
     def _classify(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Settle on which side of the threshold each edge lies. Returns those that changed."""
         open_ = undecided(self.lower, self.upper, self.threshold)
+        # What is already as narrow as the world can make it stays blocked.
+        open_ = open_[self.upper[open_] - self.lower[open_] > self.world.resolution]
         if len(open_):
             self._refine(open_, self.threshold)
         return reclassify(self.lower, self.threshold, self.blocked)
@@ -174,7 +176,8 @@ class Roadmap:
         marked[index] = True
         for handle, near in self._near.items():
             if threshold is None:
-                loose = np.flatnonzero((near.upper - near.lower > TOLERANCE) & (near.upper > 0))
+                wide = near.upper - near.lower > self.world.resolution
+                loose = np.flatnonzero(wide & (near.upper > 0))
             else:
                 loose = undecided(near.lower, near.upper, threshold)
             loose = loose[marked[near.index[loose]]]

@@ -64,6 +64,11 @@ class World(Protocol):
         ...
 
     @property
+    def resolution(self) -> float:
+        """Metres: `refine` may leave intervals this wide."""
+        ...
+
+    @property
     def handles(self) -> Sequence[int]:
         """The obstacles present, in the order of their arrival."""
         ...
@@ -86,7 +91,7 @@ class World(Protocol):
         ends: NDArray[np.float64],
         threshold: float | None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Intervals `[k]`, `[k]` that do not hold the threshold; of no width if it is None."""
+        """Intervals `[k]`, `[k]` that exclude the threshold, or are at most `resolution` wide."""
         ...
 
     def certify(
@@ -133,6 +138,7 @@ class SceneWorld:
     """
 
     certified = True
+    resolution = TOLERANCE
 
     def __init__(
         self,
