@@ -9,8 +9,8 @@ eikonal problem. The scheme is the fixed point of
 where y is the foot of a motion of about two cells in direction a, l its length, x_m its middle, and
 V and s are interpolated. Feet of neighbouring directions are joined to simplices; the minimum over
 each is taken in closed form, with V linear on it (Tsitsiklis 1995; Sethian and Vladimirsky 2003),
-so directions are not quantised. Longer motions spread a value less by interpolation but cut corners:
-two cells in 16 directions, and one cell along each input, did best for the unicycle.
+so directions are not quantised. Longer motions spread a value less but cut corners: of those tried,
+two cells in 16 directions, and one along each input, did best for the unicycle.
 
 Nodes are swept in alternating orders (Gauss-Seidel); a node is computed again only when a value
 that it reads has changed. Values only fall, so an unfinished result bounds the scheme's from above.
