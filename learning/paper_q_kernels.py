@@ -1,7 +1,7 @@
-"""One step of the paper's law, literal and repaired; symbols as in `paper_q_law`."""
+"""One step of the paper's law with any of its slips left in; symbols as in `paper_q_law`."""
 
 import numpy as np
-from numba import njit, types
+from numba import boolean, njit, types
 
 from ocp.jit import MATRIX, VECTOR, compiled
 
@@ -54,99 +54,92 @@ def _excite(excitation, sigma, step):
             excitation[i, j] += scale * sigma[i] * sigma[j]
 
 
-@compiled(
-    types.void(MATRIX, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, MATRIX, MATRIX)
-)
-def literal_step(past, times, M, R, terminal, inverse, gains, critic, actor, excitation):
-    """`past` is U(t - Delta t), U(t); `times` is nu(t), nu(t - T); `inverse` is Q_uu^-1."""
-    n, m, count = M.shape[0], R.shape[0], critic.shape[0]
-    step, critic_gain, actor_gain = gains[0], gains[1], gains[2]
-    before, now = np.empty(count), np.empty(count)
-    _products(past[0], n, before)
-    _products(past[1], n, now)
-    sigma = times[0] * (now - before)
-    final = times[0] * now
-    cost = 0.5 * step * (_running_cost(past[0], M, R) + _running_cost(past[1], M, R))
-    error_1 = times[0] * _dot(critic, now) - times[1] * _dot(critic, before) + cost
-    at_end = 0.0
-    for i in range(n):
-        for j in range(n):
-            at_end += 0.5 * past[1, i] * terminal[i, j] * past[1, j]
-    error_2 = at_end - _dot(critic, final)
-    # e_a with the critic of this instant, before it moves.
-    first = n * (n + 1) // 2
-    wanted = np.zeros(m)
-    for k in range(m):
-        for i in range(n):
-            wanted[k] += 2.0 * times[0] * critic[first + k * n + i] * past[1, i]
-    error_a = np.zeros(m)
-    for k in range(m):
-        for i in range(n):
-            error_a[k] += times[0] * actor[i, k] * past[1, i]
-        for other in range(m):
-            error_a[k] += inverse[k, other] * wanted[other]
-    first_scale = error_1 / (1.0 + _dot(sigma, sigma)) ** 2
-    second_scale = error_2 / (1.0 + _dot(final, final)) ** 2
-    for i in range(count):
-        critic[i] -= step * critic_gain * (sigma[i] * first_scale + final[i] * second_scale)
-    for i in range(n):
-        for k in range(m):
-            actor[i, k] -= step * actor_gain * past[1, i] * error_a[k]
-    _excite(excitation, sigma, step)
+ASCENT, TERMINAL_EVERYWHERE, PLAIN_ACTOR, HALF_VECH, ESTIMATED_QUU = range(5)
 
 
 @compiled(
     types.void(
-        MATRIX, MATRIX, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, MATRIX, MATRIX
+        MATRIX,
+        MATRIX,
+        VECTOR,
+        MATRIX,
+        MATRIX,
+        MATRIX,
+        MATRIX,
+        VECTOR,
+        boolean[::1],
+        VECTOR,
+        MATRIX,
+        MATRIX,
     )
 )
-def repaired_step(past, stored, times, M, R, terminal, inverse, gains, critic, actor, excitation):
-    """`past` is U at the samples of [t - Delta t, t]; `times` is nu at t, t - Delta t and T."""
+def paper_step(
+    past, stored, times, M, R, terminal, inverse, gains, slips, critic, actor, excitation
+):
+    """Euler step of (22) and (23).
+
+    `past` is U at the samples of [t - Delta t, t]; `stored` the remembered states; `times` is nu at
+    t, in e_c1's delayed term, in sigma's delayed term, and at T; `inverse` is Q_uu^-1; `gains` is
+    the step, alpha_c and alpha_a; `slips` says which are left in.
+    """
     n, m, count = M.shape[0], R.shape[0], critic.shape[0]
     step, critic_gain, actor_gain = gains[0], gains[1], gains[2]
     last = past.shape[0] - 1
-    free = count - m * (m + 1) // 2
+    # The weights of a known Q_uu = R neither move nor depend on time.
+    free = count if slips[ESTIMATED_QUU] else count - m * (m + 1) // 2
+    doubled = 2.0 if slips[HALF_VECH] else 1.0
+    first = n * (n + 1) // 2
     before, now = np.empty(count), np.empty(count)
     _products(past[0], n, before)
     _products(past[last], n, now)
-    sigma = np.empty(count)
-    for i in range(count):
-        # The weights of Q_uu = R are known and do not depend on time.
-        sigma[i] = times[0] * now[i] - times[1] * before[i] if i < free else now[i] - before[i]
-    cost = 0.0
+    sigma = now - before
+    error_1 = _dot(critic, sigma)
+    for i in range(free):
+        error_1 += critic[i] * ((times[0] - 1.0) * now[i] - (times[1] - 1.0) * before[i])
+        sigma[i] = times[0] * now[i] - times[2] * before[i]
     for k in range(last):
-        cost += 0.5 * step * (_running_cost(past[k], M, R) + _running_cost(past[k + 1], M, R))
-    error_1 = _dot(critic, sigma) + cost
+        ends = _running_cost(past[k], M, R) + _running_cost(past[k + 1], M, R)
+        error_1 += 0.5 * step * ends
     change = sigma * (error_1 / (1.0 + _dot(sigma, sigma)) ** 2)
-    first = n * (n + 1) // 2
-    U, at_end = np.empty(n + m), np.empty(count)
-    wanted = np.empty(m)
-    for row in range(stored.shape[0]):
-        x = stored[row]
-        for k in range(m):
-            wanted[k] = times[2] * _dot(critic[first + k * n : first + (k + 1) * n], x)
-        U[:n] = x
-        for k in range(m):
-            U[n + k] = -_dot(inverse[k], wanted)
+    sign = 1.0 if slips[ASCENT] else -1.0
+    U, at_end, wanted = np.empty(n + m), np.empty(count), np.empty(m)
+    rows = 1 if slips[TERMINAL_EVERYWHERE] else stored.shape[0]
+    for row in range(rows):
+        if slips[TERMINAL_EVERYWHERE]:
+            U[:] = past[last]
+            nu = times[0]
+        else:
+            U[:n] = stored[row]
+            nu = times[3]
+            for k in range(m):
+                weights = critic[first + k * n : first + (k + 1) * n]
+                wanted[k] = doubled * nu * _dot(weights, U[:n])
+            for k in range(m):
+                U[n + k] = -_dot(inverse[k], wanted)
         _products(U, n, at_end)
         for i in range(free):
-            at_end[i] *= times[2]
+            at_end[i] *= nu
         error_2 = -_dot(critic, at_end)
         for i in range(n):
             for j in range(n):
-                error_2 += 0.5 * x[i] * terminal[i, j] * x[j]
-        scale = error_2 / ((1.0 + _dot(at_end, at_end)) ** 2 * stored.shape[0])
+                error_2 += 0.5 * U[i] * terminal[i, j] * U[j]
+        scale = sign * error_2 / ((1.0 + _dot(at_end, at_end)) ** 2 * rows)
         for i in range(count):
-            change[i] -= at_end[i] * scale
+            change[i] += at_end[i] * scale
     x = past[last, :n]
     mu_x = times[0] * x
     for k in range(m):
-        wanted[k] = times[0] * _dot(critic[first + k * n : first + (k + 1) * n], x)
-    scale = actor_gain * step / (1.0 + _dot(mu_x, mu_x))
+        weights = critic[first + k * n : first + (k + 1) * n]
+        wanted[k] = doubled * times[0] * _dot(weights, x)
+    scale = actor_gain * step
+    if not slips[PLAIN_ACTOR]:
+        scale /= 1.0 + _dot(mu_x, mu_x)
     for k in range(m):
-        error_a = _dot(inverse[k], wanted) + _dot(actor[:, k].copy(), mu_x)
+        error_a = _dot(inverse[k], wanted)
         for i in range(n):
-            actor[i, k] -= scale * mu_x[i] * error_a
+            error_a += actor[i, k] * mu_x[i]
+        for i in range(n):
+            actor[i, k] -= scale * (x[i] if slips[PLAIN_ACTOR] else mu_x[i]) * error_a
     for i in range(free):
         critic[i] -= step * critic_gain * change[i]
     _excite(excitation, sigma, step)

@@ -1,8 +1,8 @@
 """The actor-critic law of Kontoudis, Xu and Vamvoudakis (RRT-Q^X, 2022), kept as a baseline.
 
-`LiteralLaw` is (12)-(16), (19)-(25) as printed; `RepairedLaw` mends the slips that stop it from
-running. Neither was seen to converge to the optimal gain on any plant: regulate with `q_learning`.
-`docs/q-learning-slips.md` lists each slip, what the printed form does and the repair.
+`PaperLaw` is (12)-(16), (19)-(25) with a set of `Slip`s left in: all of them make the law as
+printed (`LITERAL`), none the repaired one (`REPAIRED`). Neither was seen to converge to the optimal
+gain on any plant: regulate with `q_learning`. `docs/q-learning-slips.md` shows what each slip does.
 
 Symbols of the paper, here and in the kernels:
 
@@ -15,18 +15,29 @@ Symbols of the paper, here and in the kernels:
 
 Entries of W_c come in the order that (24) indexes: the products x_i x_j (i <= j), u_k x_i (k by k),
 u_k u_l (k <= l). Costs carry the paper's one half.
+
+Choices that the print leaves open, the same in both forms: U (x) U stands for its N(N+1)/2 distinct
+products, as `vech` needs (the print has N^2); nu and mu are one Gaussian of time; the integral in
+(19) is taken by the trapezoid rule on the samples; the flows (22), (23) by Euler steps; the weights
+of Q_uu, which (14) inverts and which the paper wants "non-zero", begin at R.
 """
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from enum import Enum
 from time import thread_time
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from learning.gain_bound import GainBound, gain_bound
-from learning.paper_q_kernels import literal_step, repaired_step
+from learning.paper_q_kernels import (
+    ASCENT,
+    ESTIMATED_QUU,
+    HALF_VECH,
+    PLAIN_ACTOR,
+    TERMINAL_EVERYWHERE,
+    paper_step,
+)
 from learning.quadratic_cost import QuadraticCost
 
 Array = NDArray[np.float64]
@@ -77,42 +88,119 @@ class PaperSettings:
             raise ValueError(f"probing: must be non-negative and finite, got {self.probing}")
 
 
-class PaperLaw(ABC):
-    """Either form of the law: `control` once a sample, `new_leg` at a waypoint switch.
+class Slip(Enum):
+    """A slip of the print that a law can keep; the text is the printed form, then the repair."""
+
+    ASCENT = (
+        "(22): the second term climbs, since de_c2/dW_c = -sigma_f",
+        "its sign is turned",
+    )
+    DELAYED_TIME = (
+        "(19): nu(t - T) on e_c1's delayed term, and nu(t) on sigma's",
+        "nu(t - Delta t) on both",
+    )
+    TERMINAL_EVERYWHERE = (
+        "e_c2 holds at T alone but is used at every t, with the present x and u",
+        "imposed with nu(T) on remembered states x, at the optimal input there: "
+        "x'P_T x/2 = W_c' nu(T) z(x, -R^-1 Q_ux(T) x)",
+    )
+    PLAIN_ACTOR = (
+        "(23) lacks mu and (24)'s normalisation: Euler needs step alpha_a |x|^2 < 2",
+        "dW_a/dt = -alpha_a mu x e_a' / (1 + |mu x|^2)",
+    )
+    HALF_VECH = (
+        "nu' W_c = vech(Q)/2: off-diagonal entries count half of what U'QU asks for",
+        "c_ii = Q_ii/2, c_ij = Q_ij",
+    )
+    ESTIMATED_QUU = (
+        "Q_uu is estimated by the critic and inverted",
+        "Q_uu = R, which is known",
+    )
+    COARSE_STEP = (
+        "Euler steps of the resolution, Delta t = 50 ms",
+        "Euler steps of the sample period, 5 ms",
+    )
+
+    @property
+    def printed(self) -> str:
+        return self.value[0]
+
+    @property
+    def repair(self) -> str:
+        return self.value[1]
+
+
+LITERAL = frozenset(Slip)
+REPAIRED: frozenset[Slip] = frozenset()
+
+_IN_KERNEL = {
+    Slip.ASCENT: ASCENT,
+    Slip.TERMINAL_EVERYWHERE: TERMINAL_EVERYWHERE,
+    Slip.PLAIN_ACTOR: PLAIN_ACTOR,
+    Slip.HALF_VECH: HALF_VECH,
+    Slip.ESTIMATED_QUU: ESTIMATED_QUU,
+}
+
+
+class PaperLaw:
+    """The law with the given slips: `control` once a sample, `new_leg` at a waypoint switch.
 
     Attributes:
         cost: what to minimise.
         settings: gains and open choices.
+        slips: those left in.
         critic: W_c `[c]`.
         actor: W_a `[n, m]`.
         clock: seconds since the leg began.
         diverged: a weight left [-DIVERGED, DIVERGED]; the law is then frozen and gives u = 0.
-        update_times: seconds of CPU time of each sample's update.
+        update_times: seconds of CPU time of each update.
     """
 
-    name: ClassVar[str]
-
     def __init__(
-        self, cost: QuadraticCost, settings: PaperSettings, rng: np.random.Generator
+        self,
+        cost: QuadraticCost,
+        settings: PaperSettings,
+        rng: np.random.Generator,
+        slips: frozenset[Slip] = LITERAL,
     ) -> None:
-        self.cost, self.settings, self.rng = cost, settings, rng
+        self.cost, self.settings, self.rng, self.slips = cost, settings, rng, slips
         n, m = cost.n, cost.m
         self._xx, self._xu = n * (n + 1) // 2, n * m
         count = self._xx + self._xu + m * (m + 1) // 2
         self.critic = rng.uniform(0.0, settings.initial, count)
         self.actor = rng.uniform(0.0, settings.initial, (n, m))
-        self._initialise_uu()
         self.clock = 0.0
         self.diverged = False
         self.update_times: list[float] = []
-        self._excitation = np.zeros((count, count))
-        self._held = np.zeros(m)
+        rows, columns = np.triu_indices(m)
+        self._uu_scale = np.where(rows == columns, 2.0, 1.0)
+        if Slip.HALF_VECH in slips:
+            self._uu_scale = np.full(len(rows), 2.0)
+        estimated = Slip.ESTIMATED_QUU in slips
+        at_start = float(self.time_function(0.0)) if estimated else 1.0
+        self.critic[self._xx + self._xu :] = cost.R[rows, columns] / (self._uu_scale * at_start)
         # The cost's own arrays are read-only, which compiled signatures tell apart.
         self._matrices = cost.M.copy(), cost.R.copy(), cost.terminal.copy()
-        self._lag = round(settings.resolution / settings.sample_period)
-        # Past U and sigma's own past: the last `lag` + 1 samples, newest last.
-        self._past = np.zeros((self._lag + 1, n + m))
-        self._known = 0
+        self._inverse = np.linalg.inv(cost.R)
+        self._flags = np.zeros(len(_IN_KERNEL), dtype=np.bool_)
+        self._flags[[_IN_KERNEL[s] for s in slips if s in _IN_KERNEL]] = True
+        self._excitation = np.zeros((count, count))
+        self._held = np.zeros(m)
+        lag = round(settings.resolution / settings.sample_period)
+        coarse = Slip.COARSE_STEP in slips
+        self._stride = lag if coarse else 1
+        self._step_length = settings.resolution if coarse else settings.sample_period
+        # U at the steps of [t - Delta t, t], newest last.
+        self._past = np.zeros((2 if coarse else lag + 1, n + m))
+        self._store_every = 1 if coarse else lag
+        self._stored = np.zeros((settings.memory, n))
+        self._samples, self._known, self._steps, self._remembered = 0, 0, 0, 0
+
+    @property
+    def name(self) -> str:
+        names = {LITERAL: "paper-literal", REPAIRED: "paper-repaired"}
+        kept = ", ".join(slip.name for slip in Slip if slip in self.slips)
+        return names.get(self.slips, f"paper-repaired with {kept}")
 
     def time_function(self, t: ArrayLike) -> Array:
         """nu(t) = mu(t), of the time in the leg."""
@@ -127,7 +215,8 @@ class PaperLaw(ABC):
     def Q_xu(self, t: float) -> Array:
         """The critic's estimate of PB `[n, m]` at time t."""
         block = self.critic[self._xx : self._xx + self._xu]
-        return self._scale_xu * float(self.time_function(t)) * block.reshape(self.cost.m, -1).T
+        scale = 2.0 if Slip.HALF_VECH in self.slips else 1.0
+        return scale * float(self.time_function(t)) * block.reshape(self.cost.m, -1).T
 
     def gain_bound(self) -> GainBound:
         """(25) at the present estimate."""
@@ -150,6 +239,7 @@ class PaperLaw(ABC):
     def new_leg(self) -> None:
         """The state jumps to the next waypoint's error coordinates: differences across are void."""
         self.clock = 0.0
+        self._samples = 0
         self._known = 0
 
     def control(self, state: ArrayLike) -> Array:
@@ -163,9 +253,9 @@ class PaperLaw(ABC):
             raise ValueError(f"state: must be {self.cost.n} finite numbers, got {x.tolist()}")
         if self.diverged:
             return np.zeros(self.cost.m)
-        begun = thread_time()
-        self._step(x)
-        self.update_times.append(thread_time() - begun)
+        if self._samples % self._stride == 0:
+            self._step(x)
+        self._samples += 1
         self.clock += self.settings.sample_period
         weights = max(np.abs(self.critic).max(), np.abs(self.actor).max())
         if not weights < DIVERGED:
@@ -173,146 +263,51 @@ class PaperLaw(ABC):
             return np.zeros(self.cost.m)
         return self._held
 
-    def _actor_input(self, x: Array) -> Array:
-        u = float(self.time_function(self.clock)) * self.actor.T @ x
-        if self.settings.probing > 0:
-            u += self.settings.probing * self.rng.standard_normal(self.cost.m)
-        return u
-
-    def _remember(self, x: Array) -> None:
+    def _step(self, x: Array) -> None:
+        t, settings = self.clock, self.settings
+        self._held = float(self.time_function(t)) * self.actor.T @ x
+        if settings.probing > 0:
+            self._held += settings.probing * self.rng.standard_normal(self.cost.m)
         self._past[:-1] = self._past[1:]
         self._past[-1] = [*x, *self._held]
-        self._known = min(self._known + 1, self._lag + 1)
-
-    _scale_xu: ClassVar[float]
-
-    @abstractmethod
-    def _initialise_uu(self) -> None:
-        """Give the weights of Q_uu, which (14) inverts, the values of R."""
-
-    @abstractmethod
-    def _step(self, x: Array) -> None:
-        """One sample: update the weights and the held input."""
-
-
-class LiteralLaw(PaperLaw):
-    """The law as printed. Where the print leaves a choice, this is the reading:
-
-    - `U (x) U`: its N(N+1)/2 distinct products, as `vech` needs (the print has N^2 of them);
-      nu' W_c = vech(Q)/2 plainly, so off-diagonal entries count half of what U'QU asks for.
-    - (19): nu(t - T) on the delayed term of e_c1, nu(t) on both terms of sigma, as printed.
-    - e_c2: at every t, with the present state, though the condition (18) belongs to T.
-    - (22): both terms with the printed sign; the second climbs.
-    - (23): neither mu nor (24)'s normalisation.
-    - The integral in (19) by the trapezoid rule, both laws by Euler steps of Delta t.
-    - Q_uu is read from the critic and inverted.
-    """
-
-    name = "paper-literal"
-    _scale_xu = 2.0
-
-    def _initialise_uu(self) -> None:
-        rows, columns = np.triu_indices(self.cost.m)
-        start = self._xx + self._xu
-        nu = float(np.exp(-0.5 * (self.settings.center / self.settings.width) ** 2))
-        self.critic[start:] = 0.5 * self.cost.R[rows, columns] / nu
-
-    def __init__(
-        self, cost: QuadraticCost, settings: PaperSettings, rng: np.random.Generator
-    ) -> None:
-        super().__init__(cost, settings, rng)
-        self._ticks = 0
-
-    def new_leg(self) -> None:
-        super().new_leg()
-        self._ticks = 0
-
-    def _step(self, x: Array) -> None:
-        tick = self._ticks % self._lag == 0
-        self._ticks += 1
-        if not tick:
+        self._known = min(self._known + 1, len(self._past))
+        if self._known < len(self._past):
             return
-        self._held = self._actor_input(x)
-        self._past[0] = self._past[-1]
-        self._past[-1] = [*x, *self._held]
-        self._known += 1
-        if self._known < 2:
+        if self._steps % self._store_every == 0:
+            self._stored[self._remembered % settings.memory] = x
+            self._remembered += 1
+        self._steps += 1
+        late, horizon = t - settings.resolution, self.cost.horizon
+        moments = [t, late, late, horizon]
+        if Slip.DELAYED_TIME in self.slips:
+            moments = [t, t - horizon, t, horizon]
+        begun = thread_time()
+        if Slip.ESTIMATED_QUU in self.slips and not self._invert_estimate(t):
+            self.diverged = True
             return
-        t, settings = self.clock, self.settings
-        times = np.array([self.time_function(t), self.time_function(t - self.cost.horizon)])
-        try:
-            inverse = np.linalg.inv(self._Q_uu(t))
-        except np.linalg.LinAlgError:
-            self.critic[:] = np.inf
-            return
-        literal_step(
-            np.ascontiguousarray(self._past[[0, -1]]),
-            times,
-            *self._matrices,
-            inverse,
-            np.array([settings.resolution, settings.critic_gain, settings.actor_gain]),
-            self.critic,
-            self.actor,
-            self._excitation,
-        )
-
-    def _Q_uu(self, t: float) -> Array:
-        m = self.cost.m
-        rows, columns = np.triu_indices(m)
-        entries = 2.0 * self.time_function(t) * self.critic[self._xx + self._xu :]
-        block = np.empty((m, m))
-        block[rows, columns] = entries
-        block[columns, rows] = entries
-        return block
-
-
-class RepairedLaw(PaperLaw):
-    """The law with its slips mended: finite on the paper's rover, but not convergent.
-
-    - Q = sum of c_ij U_i U_j over i <= j with c_ii = Q_ii/2, c_ij = Q_ij.
-    - s = nu z, sigma = s(t) - s(t - Delta t): each term with its own time.
-    - Terminal condition at T alone, on remembered states, at the *optimal* input there:
-      x'P_T x/2 = W_c' nu(T) z(x, -R^-1 Q_ux(T) x); the second term of (22) descends.
-    - dW_a/dt = -alpha_a mu x e_a' / (1 + |mu x|^2).
-    - Q_uu = R, which is known.
-    - Euler steps of the sample period (5 ms is meant), integral by the trapezoid rule on samples.
-    """
-
-    name = "paper-repaired"
-    _scale_xu = 1.0
-
-    def _initialise_uu(self) -> None:
-        rows, columns = np.triu_indices(self.cost.m)
-        entries = self.cost.R[rows, columns] * np.where(rows == columns, 0.5, 1.0)
-        self.critic[self._xx + self._xu :] = entries
-
-    def __init__(
-        self, cost: QuadraticCost, settings: PaperSettings, rng: np.random.Generator
-    ) -> None:
-        super().__init__(cost, settings, rng)
-        self._inverse = np.linalg.inv(cost.R)
-        self._stored = np.zeros((settings.memory, cost.n))
-        self._counts = np.zeros(2, dtype=np.int64)
-
-    def _step(self, x: Array) -> None:
-        self._held = self._actor_input(x)
-        self._remember(x)
-        if self._known < self._lag + 1:
-            return
-        t, settings = self.clock, self.settings
-        if self._counts[1] % self._lag == 0:
-            self._stored[self._counts[0] % settings.memory] = x
-            self._counts[0] += 1
-        self._counts[1] += 1
-        times = self.time_function(np.array([t, t - settings.resolution, self.cost.horizon]))
-        repaired_step(
+        paper_step(
             self._past,
-            self._stored[: min(int(self._counts[0]), settings.memory)],
-            times,
+            self._stored[: min(self._remembered, settings.memory)],
+            self.time_function(np.array(moments)),
             *self._matrices,
             self._inverse,
-            np.array([settings.sample_period, settings.critic_gain, settings.actor_gain]),
+            np.array([self._step_length, settings.critic_gain, settings.actor_gain]),
+            self._flags,
             self.critic,
             self.actor,
             self._excitation,
         )
+        self.update_times.append(thread_time() - begun)
+
+    def _invert_estimate(self, t: float) -> bool:
+        """Q_uu^-1 of the critic; False if it has become singular."""
+        rows, columns = np.triu_indices(self.cost.m)
+        entries = self._uu_scale * self.time_function(t) * self.critic[self._xx + self._xu :]
+        block = np.empty((self.cost.m, self.cost.m))
+        block[rows, columns] = entries
+        block[columns, rows] = entries
+        try:
+            self._inverse = np.linalg.inv(block)
+        except np.linalg.LinAlgError:
+            return False
+        return bool(np.isfinite(self._inverse).all())

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from learning.certificate import certify, relative_gain_error
 from learning.learned_regulator import LearnedRegulator
-from learning.paper_q_law import LiteralLaw, PaperLaw, PaperSettings, RepairedLaw
+from learning.paper_q_law import LITERAL, REPAIRED, PaperLaw, PaperSettings
 from learning.q_learning import LearnerSettings, QLearner
 from learning.window_regression import WindowRegression
 from ocp.files import atomic_path, write_text
@@ -157,8 +157,8 @@ def run(system: SystemFile, learner: str = "q-learning", seed: int = 0) -> Regul
         student = QLearner(system.cost, learner_settings(system), probing)
         watch = _watch_learner(student, exact, history)
     else:
-        form = LiteralLaw if learner == "paper-literal" else RepairedLaw
-        law = form(system.cost, paper_settings(system), probing)
+        slips = LITERAL if learner == "paper-literal" else REPAIRED
+        law = PaperLaw(system.cost, paper_settings(system), probing, slips)
         log.info("before the run: %s", law.gain_bound())
         watch = _watch_law(law, exact, history)
         student = law
