@@ -7,7 +7,6 @@ robot itself. Along a straight edge the distance of two bodies changes at most a
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -88,12 +87,14 @@ class RobotWorld:
             raise ValueError(
                 f"lower: the plant has {plant.num_positions()} positions, got {len(self.lower)}"
             )
-        self._checker = SceneGraphCollisionChecker(
-            model=model,
-            robot_model_instances=list(robots),
-            edge_step_size=sample_step,
-            implicit_context_parallelism=Parallelism(num_threads=1),
-        )
+        # A dictionary, since Drake's type stubs do not know these keywords.
+        options: dict[str, Any] = {
+            "model": model,
+            "robot_model_instances": list(robots),
+            "edge_step_size": sample_step,
+            "implicit_context_parallelism": Parallelism(num_threads=1),
+        }
+        self._checker: Any = SceneGraphCollisionChecker(**options)
         self.resolution, self._sample_step = float(resolution), float(sample_step)
         self._plant = self._checker.plant()
         self._checker.UpdatePositions((self.lower + self.upper) / 2)
@@ -125,7 +126,7 @@ class RobotWorld:
             raise FileNotFoundError(f"model: no file {path}")
         builder = RobotDiagramBuilder()
         try:
-            robots = builder.parser().AddModels(str(path))
+            robots = builder.parser().AddModels(path)
         except RuntimeError as error:
             raise ValueError(f"model: {path} could not be read: {error}") from error
         return cls(builder.Build(), robots, obstacles, **options)
@@ -289,7 +290,8 @@ class RobotWorld:
         from pydrake.math import RigidTransform, RotationMatrix
 
         d = solid.dimension
-        rotation, center = np.eye(3), np.zeros(3)
+        rotation: Any = np.eye(3)
+        center: Any = np.zeros(3)
         rotation[:d, :d], center[:d] = solid.rotation, solid.center
         before = self._geometries()
         added = self._checker.AddCollisionShapeToBody(
@@ -380,8 +382,8 @@ class RobotWorld:
 
 def three_link_arm(obstacles: Sequence[Solid | Obstacle] = (), **options: Any) -> RobotWorld:
     """A planar arm of three links (1, 0.8 and 0.6 m) at the origin, among solids of the plane."""
-    with resources.as_file(resources.files("planners") / "models" / "three_link_arm.sdf") as path:
-        return RobotWorld.from_file(path, obstacles, **options)
+    path = Path(__file__).parent / "models" / "three_link_arm.sdf"
+    return RobotWorld.from_file(path, obstacles, **options)
 
 
 def _bodies(plant: Any) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,11 +36,12 @@ class PaddedChecker:
         )
         plant.Finalize()
         self._world_body = plant.world_body()
-        self._checker = SceneGraphCollisionChecker(
-            model=builder.Build(),
-            robot_model_instances=[model],
-            edge_step_size=0.05,
-        )
+        options: dict[str, Any] = {
+            "model": builder.Build(),
+            "robot_model_instances": [model],
+            "edge_step_size": 0.05,
+        }
+        self._checker = SceneGraphCollisionChecker(**options)
         self._dimension = dimension
 
     def set(self, solids: Iterable[Solid], padding: float) -> None:
@@ -47,7 +49,8 @@ class PaddedChecker:
         self._checker.RemoveAllAddedCollisionShapes()
         d = self._dimension
         for k, solid in enumerate(solids):
-            rotation, center = np.eye(3), np.zeros(3)
+            rotation: Any = np.eye(3)
+            center: Any = np.zeros(3)
             rotation[:d, :d], center[:d] = solid.rotation, solid.center
             pose = RigidTransform(RotationMatrix(rotation), center)
             shape = drake_shape(solid, height=100.0 if d == 2 else None)

@@ -1,11 +1,13 @@
 """Laws of RRT^X: after every change the repaired tree is the shortest-path tree."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ball_world import BallWorld
 from oracles import check_costs, check_tree, clearance_by_search, costs_by_dijkstra
 
 from ocp.obstacle import Obstacle
@@ -102,6 +104,28 @@ def test_a_long_fuzz_in_the_plane() -> None:
         check_costs(tree)
 
 
+@pytest.mark.parametrize("dimension", [4, 5, 6, 7])
+def test_a_fuzz_in_more_dimensions(dimension: int) -> None:
+    rng = np.random.default_rng(dimension)
+    box = np.full(dimension, SIDE)
+    world = BallWorld(-box, box)
+    for _ in range(3):
+        world.add((rng.uniform(-box, box), rng.uniform(1, 5)))
+    tree = RRTX(world, 0.9 * box, -0.9 * box, 150, seed=1, reach=2 * SIDE)
+    for _ in range(12):
+        tree.change(
+            add=[(rng.uniform(-box, box), rng.uniform(1, 5))],
+            remove=list(world.handles)[:1],
+            move={world.handles[-1]: rng.normal(size=dimension)},
+            padding=rng.uniform(0, 2),
+            robot=rng.uniform(-box, box),
+        )
+        tree.grow(10)
+        check_costs(tree)
+        if tree.change().route is not None:
+            assert world.clearance(tree.route.points) > tree.padding
+
+
 @settings(max_examples=10)
 @given(seed=st.integers(0, 10_000))
 def test_an_unsettled_tree_already_knows_the_robots_cost(seed: int) -> None:
@@ -166,6 +190,7 @@ def test_routes_are_free_under_the_padded_checker_of_drake(dimension: int) -> No
         if update.route is None:
             continue
         seen += 1
+        assert isinstance(tree.world, SceneWorld)
         checker.set(tree.world.obstacles.values(), tree.padding)
         assert checker.free(update.route.points, step=0.01)
         assert update.route.certified
@@ -348,7 +373,8 @@ def test_bad_changes_are_refused_and_leave_the_tree_in_order(change: dict, messa
         ({"padding": 1.0, "horizon": 0.5}, "horizon"),
     ],
 )
-def test_bad_options_are_refused(options: dict, message: str) -> None:
+def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
     world = SceneWorld([-SIDE] * 2, [SIDE] * 2)
     with pytest.raises(ValueError, match=message):
-        RRTX(world, **({"goal": [9, 9], "robot": [0, 0]} | options))
+        merged: dict[str, Any] = {"goal": [9, 9], "robot": [0, 0]} | options
+        RRTX(world, **merged)
