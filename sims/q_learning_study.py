@@ -66,8 +66,6 @@ def plant_of(system: SystemFile) -> LinearPlant:
 
 def recorded(system: SystemFile, seeds: Sequence[int]) -> tuple[Array, Array]:
     """Probed motions of a system for many seeds: see `probed_motions`."""
-    gain = system.behaviour_gain
-    assert gain is not None
     return probed_motions(
         plant_of(system),
         system.start,
@@ -75,7 +73,7 @@ def recorded(system: SystemFile, seeds: Sequence[int]) -> tuple[Array, Array]:
         system.sample_period,
         SUBSTEPS,
         system.probing,
-        gain,
+        system.behaviour_gain,
         system.noise,
         seeds,
     )

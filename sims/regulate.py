@@ -138,7 +138,8 @@ def regulate(
     """
     if learner not in LEARNERS:
         raise ValueError(f"learner: must be one of {', '.join(LEARNERS)}, got {learner!r}")
-    result = run(SystemFile.load(system_file), learner, seed)
+    looks = 1 if out is None else HISTORY
+    result = run(SystemFile.load(system_file), learner, seed, looks)
     if not result.converged:
         log.warning("%s did not converge: %s", learner, result.reason)
     if out is not None:
@@ -146,8 +147,10 @@ def regulate(
     return result.report()
 
 
-def run(system: SystemFile, learner: str = "q-learning", seed: int = 0) -> Regulation:
-    """Learn a system and judge what was learned."""
+def run(
+    system: SystemFile, learner: str = "q-learning", seed: int = 0, looks: int = HISTORY
+) -> Regulation:
+    """Learn a system and judge what was learned, with so many looks at the learner on the way."""
     probing, noise = streams(seed)
     exact = system.exact()
     history = History()
@@ -164,7 +167,7 @@ def run(system: SystemFile, learner: str = "q-learning", seed: int = 0) -> Regul
         student = law
     period = system.sample_period
     samples = round(system.data_seconds / period)
-    look = max(1, samples // HISTORY)
+    look = max(1, samples // looks)
     watched = _Watched(student, system.cost.horizon, period, look, watch)
     motion = drake_motion(
         plant, watched, system.start, samples * period, period, system.noise, noise

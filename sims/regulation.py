@@ -20,8 +20,8 @@ from ocp.jit import MATRIX, VECTOR, compiled
 Array = NDArray[np.float64]
 
 BLOWN_UP = 1e6
-LONGEST_STEP = 2e-3
-"""Seconds, Runge-Kutta steps of `regulated_costs`; the cost is then good to about 1e-10."""
+LONGEST_STEP = 1e-3
+"""Seconds, Runge-Kutta steps of `regulated_costs`; costs are then good to 1e-9 here."""
 
 
 class Controller(Protocol):

@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ class SystemFile:
     data_seconds: float = 2.0
     probing: float = 1.0
     noise: float = 0.0
-    behaviour_gain: Array | None = None
+    behaviour_gain: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         n, m = self.problem.n, self.problem.m
@@ -67,8 +67,8 @@ class SystemFile:
         if start.shape != (n,) or not np.isfinite(start).all():
             raise ValueError(f"start: must be {n} finite numbers, got {start.tolist()}")
         object.__setattr__(self, "start", start)
-        gain = self.behaviour_gain
-        gain = np.zeros((m, n)) if gain is None else np.array(gain, dtype=float)
+        gain = np.array(self.behaviour_gain, dtype=float)
+        gain = np.zeros((m, n)) if gain.size == 0 else gain
         if gain.shape != (m, n) or not np.isfinite(gain).all():
             raise ValueError(
                 f"behaviour_gain: must be {m} rows of {n} finite numbers, got {gain.tolist()}"

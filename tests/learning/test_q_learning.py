@@ -48,7 +48,7 @@ def test_probing_stops_when_the_certificate_holds_and_the_optimal_input_takes_ov
     drive(learner, plant, 2.0)
     assert not learner.probing
     state = plant.state
-    expected = -true_gains(*OSCILLATOR, times=[learner.clock])[0] @ state
+    expected = -true_gains(*OSCILLATOR, times=np.array([learner.clock]))[0] @ state
     assert learner.control(state) == pytest.approx(expected, rel=1e-5)
 
 
