@@ -27,6 +27,8 @@ BELLMAN = types.FunctionType(
     )
 )  # fmt: skip
 SCRATCH_ROWS = 6
+OVERSHOOT = 1.2  # a step that speeds up is shortened until it exceeds its cells by no more
+MAX_SHORTENINGS = 6
 SHRINK = 0.4  # of the search interval from one round of refinement to the next
 
 kernel_at = function_at(KERNEL)
@@ -118,11 +120,18 @@ def step_cost(x, u, w, functions, q, settings, values, geometry, scratch):
     if not pace > 0.0:
         return np.inf
     duration = settings[0] / pace
+    for _ in range(MAX_SHORTENINGS):
+        for i in range(n):
+            middle[i] = x[i] + 0.5 * duration * rate[i]
+        dynamics(middle, u, point)
+        extent = 0.0
+        for i in range(n):
+            extent = max(extent, duration * abs(point[i]) * geometry[n + i])
+        if extent <= OVERSHOOT * settings[0]:
+            break
+        duration *= math.sqrt(settings[0] / extent)  # exact where the motion starts from rest
     for i in range(n):
-        middle[i] = x[i] + 0.5 * duration * rate[i]
-    dynamics(middle, u, rate)
-    for i in range(n):
-        end[i] = x[i] + duration * rate[i]
+        end[i] = x[i] + duration * point[i]
 
     effort = 0.0
     if not time_free:
@@ -182,9 +191,10 @@ def step_cost(x, u, w, functions, q, settings, values, geometry, scratch):
 
 @compiled(types.void(VECTOR, types.int64, float64, VECTOR, VECTOR, VECTOR))
 def _moved(u, axis, amount, q, settings, out):
-    """Into `out`: `u` moved along one input axis, within the bounds.
+    """Into `out`: `u` moved by `amount` along one input axis, within the bounds.
 
-    For a time-free query: turned by the angle `amount` towards that axis, on u' R u = 1.
+    Axis `m` is the input's size, changed by the factor 1 + `amount`. For a time-free query `u` is
+    turned by the angle `amount` towards the axis, on u' R u = 1.
     """
     m = u.shape[0]
     if settings[2] > 0.0:
@@ -197,8 +207,10 @@ def _moved(u, axis, amount, q, settings, out):
         out[axis] += math.sin(amount) / (across * math.sqrt(q[axis]))
     else:
         for i in range(m):
-            out[i] = u[i]
-        out[axis] = min(max(u[axis] + amount, q[m + axis]), q[2 * m + axis])
+            moved = u[i] * (1.0 + amount) if axis == m else u[i]
+            if i == axis:
+                moved += amount
+            out[i] = min(max(moved, q[m + i]), q[2 * m + i])
 
 
 @compiled(
@@ -211,9 +223,10 @@ def bellman(x, u, candidates, spread, rounds, functions, q, settings, values, ge
     """min_u of `step_cost` at `x` `[n]`, and its minimiser in `u` `[m]`.
 
     Tries the given `u` (unless its first entry is NaN) and the `candidates` `[K, m]`, then refines
-    the best: in each of `rounds`, along each input axis, a parabola through the cost at the best
-    input and to both sides. The sides are `spread` `[m]` away at first (an angle for a time-free
-    query; otherwise at least half the input's size). Never returns more than the best candidate.
+    the best: in each of `rounds`, along each input axis (and in size), a parabola through the cost
+    at the best input and to both sides. The sides are `spread` `[m]` away at first (an angle for a
+    time-free query; otherwise at least half the input's size). Never returns more than the best
+    candidate.
     """
     m = u.shape[0]
     w = scalar_at(functions[1, 0], functions[1, 1])(x, q)
@@ -240,12 +253,15 @@ def bellman(x, u, candidates, spread, rounds, functions, q, settings, values, ge
             for i in range(m):
                 if abs(chosen[i]) * math.sqrt(q[i]) > largest:
                     largest, skipped = abs(chosen[i]) * math.sqrt(q[i]), i
-        for axis in range(m):
+        for axis in range(m if time_free or m == 1 else m + 1):
             if axis == skipped:
                 continue
-            size = shrink * (
-                spread[axis] if time_free else max(spread[axis], 0.5 * abs(chosen[axis]))
-            )
+            if axis == m:
+                size = 0.5 * shrink
+            elif time_free:
+                size = shrink * spread[axis]
+            else:
+                size = shrink * max(spread[axis], 0.5 * abs(chosen[axis]))
             _moved(chosen, axis, -size, q, settings, trial)
             below = step_cost(x, trial, w, functions, q, settings, values, geometry, scratch)
             _moved(chosen, axis, size, q, settings, trial)

@@ -15,7 +15,7 @@ from ocp.query import Query
 from ocp.system import System
 
 MAX_DIMENSION = 4
-EDGE_TOLERANCE = 1e-9  # in cells: how far outside still counts as on the boundary
+EDGE_TOLERANCE = 1e-9  # in cells: so close to a node is on it, so close to the box is inside
 
 # (values `[nodes]`, geometry `[4n]`, point `[n]`) -> value: the type of `interpolate`
 INTERPOLATION = types.FunctionType(float64(VECTOR, VECTOR, VECTOR))
@@ -275,7 +275,12 @@ def _locate(x, geometry, axis, n, stride):
         t = min(max(t, 0.0), count - 1.0)
         low = min(int(t), count - 2)
         high = low + 1
-    return low * stride, high * stride, t - low, stride * count
+    fraction = t - low
+    if fraction < EDGE_TOLERANCE:  # rounding must not touch an infinite neighbour
+        fraction = 0.0
+    elif fraction > 1.0 - EDGE_TOLERANCE:
+        fraction = 1.0
+    return low * stride, high * stride, fraction, stride * count
 
 
 @compiled(float64(VECTOR, VECTOR, VECTOR))

@@ -148,13 +148,20 @@ def interpolate_visible(values, geometry, point):
             k += index[2 * i + side]
             target[i] = corner_point[side, i]
         if (
-            w > 0.0
+            w > EDGE_TOLERANCE
             and math.isfinite(values[k])
             and (not check or clear_segment(point, target, data) > 0.0)
         ):
             total += w * values[k]
             weights += w
     return total / weights if weights > 0.0 else np.inf
+
+
+@compiled(types.void(VECTOR, VECTOR, MATRIX, VECTOR))
+def interpolate_visible_rows(values, geometry, points, out):
+    """`interpolate_visible` at `points` `[k, n]`."""
+    for row in range(points.shape[0]):
+        out[row] = interpolate_visible(values, geometry, points[row])
 
 
 def blocked_moves(query: Query, grid: Grid, moves: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -8,14 +8,15 @@ from numpy.typing import NDArray
 from ocp.query import Query
 
 CIRCLE = 16  # directions sampled in a plane of inputs
-HALVINGS = 7  # of the size of an input along a ray
+SIZES = 5  # of an input along a ray
+RATIO = 3.0  # between one size and the next
 
 
 def unit_directions(m: int, count: int = CIRCLE) -> NDArray[np.float64]:
     """Unit vectors `[k, m]` spread over the sphere: `count` in the plane, else 3^m - 1."""
     if m == 2:
         angles = 2 * np.pi * np.arange(count) / count
-        return np.column_stack([np.cos(angles), np.sin(angles)])
+        return np.column_stack([np.cos(angles), np.sin(angles)]).round(15)  # zeros are zeros
     lattice = np.array([c for c in product((-1.0, 0.0, 1.0), repeat=m) if any(c)])
     return lattice / np.linalg.norm(lattice, axis=1, keepdims=True)
 
@@ -37,6 +38,6 @@ def sampled_inputs(query: Query) -> tuple[NDArray[np.float64], NDArray[np.float6
     unbounded = 16 * np.sqrt(max(query.cost.goal, 1e-6) / weights)
     largest = np.where(np.isfinite(reach), reach, unbounded)
     corners = directions / abs(directions).max(axis=1, keepdims=True)
-    rays = [corners * largest * 2.0**-k for k in range(HALVINGS + 1)]
+    rays = [corners * largest * RATIO**-k for k in range(SIZES)]
     inputs = np.clip(np.concatenate([np.zeros((1, m)), *rays]), lower, upper)
-    return np.unique(inputs, axis=0), largest * 2.0**-HALVINGS
+    return np.unique(inputs, axis=0), largest * RATIO ** (1 - SIZES)
