@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import casadi as ca
@@ -108,7 +108,9 @@ class Grid:
             raise ValueError(f"grid.nodes: needs at least {3**system.n}, got {nodes}")
         box = cls.of(system, (3,) * system.n, half, margin)
         extent = np.subtract(box.upper, box.lower)
-        effort = extent / _axis_speeds(query) if query.is_time_free else np.ones(system.n)
+        effort = np.ones(system.n)
+        if query.is_time_free:
+            effort = extent / _axis_speeds(system, tuple(query.input_weights))
         # A periodic axis has as many cells as nodes, another one fewer.
         closed = 1.0 - np.array(box.periodic)
 
@@ -173,13 +175,13 @@ class Grid:
         return np.all(inside | np.array(self.periodic), axis=-1)
 
 
-def _axis_speeds(query: Query) -> NDArray[np.float64]:
+@cache
+def _axis_speeds(system: System, weights: tuple[float, ...]) -> NDArray[np.float64]:
     """`[n]` largest rate of each coordinate under inputs with u' R u = 1, no drift."""
-    system = query.system
     matrix = ca.Function("input_matrix", [system.state], [ca.densify(system.input_matrix)])
     rng = np.random.default_rng(0)
     states = rng.uniform(system.lower, system.upper, (64, system.n))
-    rows = [np.array(matrix(x)) / np.sqrt(query.input_weights) for x in states]
+    rows = [np.array(matrix(x)) / np.sqrt(weights) for x in states]
     speeds = np.linalg.norm(rows, axis=2).max(axis=0)
     if not (speeds > 0).all():
         stuck = system.coordinates[int(speeds.argmin())].name
