@@ -1,7 +1,7 @@
 """What is claimed of Q-learning, measured: prints every figure that the documents quote.
 
 `python -m sims.q_learning_study PART [--out DIR]`; PART is noise-free, noise, random, laws, slips,
-events, times, benchmarks or all. Pictures go to DIR.
+events, times, benchmarks, picture or all. Pictures go to DIR.
 """
 
 import argparse
@@ -245,7 +245,7 @@ def laws(out: Path | None = None) -> None:
     last = [errors[-1] for _, errors in curves["q-learning"]]
     print(f"rover                 q-learning     probing   100: gain error at most {max(last):.1e}")
     if out is not None:
-        draw_laws(curves, out / "laws.png")
+        draw_laws(curves, out / "q-learning-laws.png")
 
 
 def slips() -> None:
@@ -372,7 +372,7 @@ def times(out: Path | None = None) -> None:
         axes.set_xlabel("states n (inputs n/2)")
         axes.set_ylabel("CPU seconds")
         axes.legend()
-        figure.savefig(out / "times.png", dpi=110)
+        figure.savefig(out / "q-learning-times.png", dpi=110)
         plt.close(figure)
 
 
@@ -444,6 +444,17 @@ def benchmarks() -> None:
         print(f"{name:22s} " + " ".join(f"{value:10.2g}" for value in values))
 
 
+def picture(out: Path | None = None) -> None:
+    """What `zermelo regulate` draws of a noisy cart-pole."""
+    from sims.regulate import run
+    from sims.regulate_figure import draw_regulation
+
+    result = run(load("cart-pole", noise=1e-3, data_seconds=10.0))
+    print(f"cart-pole, noise 1e-3, 10 s of data: {result.report()}")
+    if out is not None:
+        draw_regulation(result).savefig(out / "regulate-cart-pole.png", dpi=80)
+
+
 def main() -> None:
     parts: dict[str, Callable[[Path | None], None]] = {
         "noise-free": lambda _: noise_free(),
@@ -454,6 +465,7 @@ def main() -> None:
         "events": lambda _: events(),
         "times": times,
         "benchmarks": lambda _: benchmarks(),
+        "picture": picture,
     }
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=[*parts, "all"])
