@@ -1,15 +1,19 @@
 """The planning methods by name: what `--method` accepts."""
 
+import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ocp.planning import Answer, OneShot, Planner
 from ocp.query import Query
+from ocp.query_family import sample_start
+from ocp.trajectory import SolveError
 from ocp.value import greedy
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -17,25 +21,36 @@ class Method:
     """A method of `zermelo plan`.
 
     Attributes:
-        summary: one line for help and error messages.
-        make: the planner; imports what it needs.
-        rehearse: solve a small version of the query, so that compiled code is loaded.
+        summary: one line on what it does.
+        planner: makes it; imports what it needs.
     """
 
     summary: str
-    make: Callable[[], Planner]
-    rehearse: Callable[[Query], None]
+    planner: Callable[[], Planner]
 
-    @cached_property
-    def planner(self) -> Planner:
-        return self.make()
+    def rehearse(self, query: Query) -> None:
+        """Solve a query of the same kind, so that a timed solve finds all compiled code loaded.
+
+        The goal is moved, so that nothing of the query itself is solved.
+        """
+        system = query.system
+        center = np.array(query.goal.center)
+        middle = ((system.lower + system.upper) / 2)[list(system.position)]
+        moved = tuple(map(float, center + 0.1 * (middle - center)))
+        other = replace(query, goal=replace(query.goal, center=moved))
+        start = sample_start(other, np.random.default_rng(0))
+        planner = self.planner()
+        try:
+            planner.policy(planner.start(other, [start]))(start)
+        except SolveError:
+            log.debug("rehearsal of %s ended without an answer", system.name)
 
 
-def _eikonal(nodes: int) -> OneShot:
+def _eikonal() -> OneShot:
     from ocp.eikonal import solve_eikonal
 
     def solve(query: Query, _starts: Sequence[NDArray[np.float64]]) -> Answer:
-        solution = solve_eikonal(query, nodes=nodes)
+        solution = solve_eikonal(query)
         return solution.policy(), solution.value
 
     return OneShot(solve)
@@ -46,8 +61,8 @@ def _exact() -> OneShot:
 
     def solve(query: Query, starts: Sequence[NDArray[np.float64]]) -> Answer:
         value = ExactValue(query)
-        for start in starts:
-            value.value(start)
+        if len(starts):
+            value.value(np.array(starts))
         return greedy(query, value), value
 
     return OneShot(solve)
@@ -63,4 +78,8 @@ def _set_valued() -> OneShot:
     return OneShot(solve)
 
 
-METHODS: dict[str, Method] = {}
+METHODS: dict[str, Method] = {
+    "exact": Method("Pontryagin shooting from every state the robot meets", _exact),
+    "eikonal": Method("fast marching on a grid, interpolated one-step lookahead", _eikonal),
+    "set-valued": Method("the set-valued method of Xu and Zhu on its coarse grid", _set_valued),
+}

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ocp.files import atomic_path, write_text
+from ocp.grid import GridValue
 from ocp.planning import Plan, deadline, plan, trajectories
 from ocp.query import Query
 from ocp.query_file import query_to_dict
@@ -85,7 +86,7 @@ def solve(
     until = trajectories(8 if count is None and seconds is None else count or 10**9)
     if seconds is not None:
         until = until | deadline(seconds)
-    answer = plan(chosen.make(), query, starts, until)
+    answer = plan(chosen.planner(), query, starts, until)
     loops = rollouts(answer.policy, starts)
     outcomes = []
     with notes.status("exact optimum") as status:
@@ -98,12 +99,11 @@ def solve(
 
 
 def _exact(query: Query, start: NDArray) -> tuple[Trajectory | None, str | None]:
-    from ocp.pontryagin import exact_trajectory
+    """The optimal motion if it counts as truth, else why it does not."""
+    from ocp.oracle import consult
 
-    try:
-        return exact_trajectory(query, start), None
-    except SolveError as error:
-        return None, str(error)
+    verdict = consult(query, start)
+    return (verdict.best, None) if verdict.established else (None, verdict.explanation)
 
 
 def run(command: "cli.Plan") -> int:
@@ -207,7 +207,7 @@ def write_outputs(
             answer.query,
             [o.rollout for o in outcomes],
             [o.exact for o in outcomes],
-            answer.value,
+            answer.value if isinstance(answer.value, GridValue) else None,
         )
         legend(figure)
         save(figure, folder / "plan.png")
