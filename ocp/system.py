@@ -136,7 +136,9 @@ class System:
         wrapped = np.array(states, dtype=float)
         for i, c in enumerate(self.coordinates):
             if c.periodic:
-                wrapped[..., i] = c.lower + np.mod(wrapped[..., i] - c.lower, c.extent)
+                x = wrapped[..., i]
+                outside = (x < c.lower) | (x >= c.upper)  # others keep their last bit
+                wrapped[..., i] = np.where(outside, c.lower + np.mod(x - c.lower, c.extent), x)
         return wrapped
 
     def difference(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:

@@ -76,6 +76,24 @@ class Demo(Common):
 
 
 @dataclass(frozen=True)
+class Regulate(Common):
+    """Learn to regulate an unknown linear plant, the exact Riccati solution beside.
+
+    Example: zermelo regulate sims/systems/rover.toml
+    """
+
+    system: tyro.conf.Positional[Path] = tyro.MISSING
+    """System file (TOML)."""
+    learner: str = "q-learning"
+    """q-learning (the law that converges), paper-literal or paper-repaired."""
+
+    def run(self) -> int:
+        from sims.regulate_command import run
+
+        return run(self)
+
+
+@dataclass(frozen=True)
 class Bench(Common):
     """Measure what the project claims: accuracy, success, time."""
 
@@ -91,6 +109,7 @@ class Bench(Common):
 Command = (
     Annotated[Plan, tyro.conf.subcommand("plan")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Regulate, tyro.conf.subcommand("regulate")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 

@@ -164,7 +164,42 @@ def test_unknown_demos_and_benchmarks_say_what_exists(run) -> None:
     assert "exact" in err
 
 
-@pytest.mark.parametrize("command", ["plan", "demo", "bench"])
+def test_regulate_prints_one_json_document(run, tmp_path: Path) -> None:
+    system = QUERIES.parent / "systems" / "double-integrator-1d.toml"
+    status, out, _ = run("regulate", str(system), "--json", "--out", str(tmp_path))
+    assert status == 0
+    document = json.loads(out)
+    assert set(document) == {
+        "learner",
+        "gain_error",
+        "cost",
+        "optimal_cost",
+        "excess",
+        "data_seconds",
+        "rank",
+        "required_rank",
+        "update_time_s",
+        "converged",
+    }
+    assert document["converged"] is True
+    assert document["gain_error"] < 1e-4
+    assert abs(document["excess"]) < 1e-5
+    assert (tmp_path / "regulate.png").exists()
+
+
+def test_regulate_refuses_bad_input(run, tmp_path: Path) -> None:
+    path = tmp_path / "system.toml"
+    good = (QUERIES.parent / "systems" / "double-integrator-1d.toml").read_text()
+    path.write_text(good.replace("horizon", "horizons"))
+    status, out, err = run("regulate", str(path))
+    assert (status, out) == (2, "")
+    assert "horizons" in err
+    status, _, err = run("regulate", str(path), "--learner", "magic")
+    assert status == 2
+    assert "learner: 'magic' is unknown; known are q-learning" in err
+
+
+@pytest.mark.parametrize("command", ["plan", "demo", "regulate", "bench"])
 def test_every_command_has_help_and_the_common_options(command: str, run) -> None:
     status, out, _ = run(command, "--help")
     assert status == 0
