@@ -29,6 +29,7 @@ BELLMAN = types.FunctionType(
 SCRATCH_ROWS = 6
 OVERSHOOT = 1.2  # a step that speeds up is shortened until it exceeds its cells by no more
 MAX_SHORTENINGS = 6
+ARRIVAL_DIRECTIONS = 64
 SHRINK = 0.4  # of the search interval from one round of refinement to the next
 
 kernel_at = function_at(KERNEL)
@@ -74,7 +75,7 @@ def arrival_costs(
 
     Infinite where no single step of `cells` cells enters it: the value is at most this.
     """
-    candidates, spread = sampled_inputs(query)
+    candidates, spread = sampled_inputs(query, ARRIVAL_DIRECTIONS)
     out = np.empty(len(states))
     nowhere = np.full(grid.size, np.inf)
     _bellman_rows(

@@ -16,7 +16,7 @@ from ocp.jit import MATRIX, VECTOR, compiled, float64
 from ocp.kernels import parameters
 from ocp.query import Query
 from ocp.shooting import shooting_addresses
-from ocp.transversality import TERMINAL, goal_condition, goal_terms
+from ocp.transversality import TERMINAL, goal_condition
 
 Array = NDArray[np.float64]
 CUBE = float64[:, :, ::1]
@@ -85,12 +85,13 @@ def backward_characteristics(
     limits = np.concatenate([[cost_limit], system.lower - room, system.upper + room])
     record = np.full((len(rows), max_points, 2 * system.n + 2), np.nan)
     lengths = np.zeros(len(rows), dtype=np.int64)
+    condition = goal_condition(query)
     _grow(
-        goal_condition(query),
+        condition.kind,
         shooting_addresses(query),
         parameters(query),
         flow_layout(query),
-        goal_terms(query),
+        condition.terms,
         rows,
         tolerance,
         limits,

@@ -136,11 +136,15 @@ def _step(functions, q, y, h, sign, energy, tolerance, stages, out):
 
 @compiled(types.void(ADDRESSES, VECTOR, VECTOR, float64, float64, MATRIX, MATRIX, MATRIX))
 def _tangent_step(functions, q, y, h, sign, stages, tangents, scratch):
-    """The same step of the tangents `[2n, c]`, from the stages of `_step`."""
+    """The same step of the tangents `[2n, c]`, from the stages of `_step`.
+
+    `scratch` `[7, 2n c]` is overwritten: six stages, and the argument of the next.
+    """
     size, columns = tangents.shape
     jacobian = np.empty((size, size))
     point, unused = np.empty(size), np.empty(size)
     linear = kernel_with_jacobian_at(functions[1, 0], functions[1, 1])
+    flat, bent = tangents.reshape(-1), scratch[6]
     for s in range(6):
         for i in range(size):
             total = 0.0
@@ -148,26 +152,26 @@ def _tangent_step(functions, q, y, h, sign, stages, tangents, scratch):
                 total += TABLEAU[s, r] * stages[r, i]
             point[i] = y[i] + h * total
         linear(point, q, unused, jacobian)
-        bent = scratch[6 * size :]
+        # Long inner loops over contiguous memory: the compiler makes vector instructions of them.
+        bent[:] = flat
+        for r in range(s):
+            weight = h * TABLEAU[s, r]
+            for j in range(flat.shape[0]):
+                bent[j] += weight * scratch[r, j]
+        stage = scratch[s]
+        stage[:] = 0.0
         for i in range(size):
-            for j in range(columns):
-                total = 0.0
-                for r in range(s):
-                    total += TABLEAU[s, r] * scratch[r * size + i, j]
-                bent[i, j] = tangents[i, j] + h * total
-        for i in range(size):
-            row = scratch[s * size + i]
-            row[:] = 0.0
+            row = stage[i * columns : (i + 1) * columns]
             for k in range(size):
                 weight = sign * jacobian[i, k]
                 if weight != 0.0:
+                    source = bent[k * columns : (k + 1) * columns]
                     for j in range(columns):
-                        row[j] += weight * bent[k, j]
-    for i in range(size):
-        for s in range(6):
-            weight = h * TABLEAU[6, s]
-            for j in range(columns):
-                tangents[i, j] += weight * scratch[s * size + i, j]
+                        row[j] += weight * source[j]
+    for s in range(6):
+        weight = h * TABLEAU[6, s]
+        for j in range(flat.shape[0]):
+            flat[j] += weight * scratch[s, j]
 
 
 @compiled(types.void(ADDRESSES, VECTOR, INTEGERS, VECTOR, VECTOR, int64, int64, MATRIX, MATRIX))
@@ -234,7 +238,7 @@ def propagate(functions, q, layout, y, tangents, duration, tolerance, limits, re
     _freeze(y, q, layout, frozen, facets)
     energy = scalar_at(functions[2, 0], functions[2, 1])(y, q)
     stages, out = np.empty((7, size)), np.empty(size)
-    scratch = np.empty((7 * 2 * n, tangents.shape[1]))
+    scratch = np.empty((7, 2 * n * tangents.shape[1]))
     gone, rows, rejected = 0.0, 0, 0
     _rate(functions, frozen, y, sign, energy, stages[0])
     fastest = 0.0

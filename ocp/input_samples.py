@@ -21,17 +21,20 @@ def unit_directions(m: int, count: int = CIRCLE) -> NDArray[np.float64]:
     return lattice / np.linalg.norm(lattice, axis=1, keepdims=True)
 
 
-def sampled_inputs(query: Query) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def sampled_inputs(
+    query: Query, circle: int = CIRCLE
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Inputs to try `[k, m]`, and how far a refinement should first look to their sides, `[m]`.
 
     For a time-free query: on u' R u = 1, sides as angles. Otherwise 0 and rays of geometric sizes
-    within the bounds; an unbounded input is sampled up to 16 sqrt(goal weight / R).
+    within the bounds; an unbounded input is sampled up to 16 sqrt(goal weight / R). In a plane of
+    inputs there are `circle` directions.
     """
     weights = query.input_weights
     m = len(weights)
-    directions = unit_directions(m)
+    directions = unit_directions(m, circle)
     if query.is_time_free:
-        gap = 2 * np.pi / CIRCLE if m == 2 else 0.6
+        gap = 2 * np.pi / circle if m == 2 else 0.6
         return np.ascontiguousarray(directions / np.sqrt(weights)), np.full(m, gap)
     lower, upper = query.input_bounds
     reach = np.maximum(abs(lower), abs(upper))

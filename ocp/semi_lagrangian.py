@@ -42,8 +42,11 @@ Ints = NDArray[np.int64]
 
 DIRECTIONS = 16
 REACH = 2  # cells
+COST_FINER = 2  # cells of the grid that holds s to one of V's: s has a square root's kink
 TOLERANCE = 1e-4  # of V; a fixed point reached to 1e-4 was within 1.1e-4 of the exact one
 MAX_SWEEPS = 1000
+
+FIXED, PLAIN = -2, -1  # kinds of nodes: see `_Problem.start`
 
 
 def sweep_time_free(
@@ -73,9 +76,10 @@ def sweep_time_free(
     if grid.dimension != query.system.n:
         raise ValueError(f"grid: {query.system.name} has {query.system.n} states, got {grid.shape}")
     problem = _Problem(query, grid)
-    values, fixed = problem.start(upper_bound)
+    values, kind, enters = problem.start(upper_bound)
+    stale = np.zeros(len(values), dtype=np.uint8)
     sweeps, updates, change = _sweeps(
-        values, fixed, *problem.tables, tolerance, max_sweeps, np.zeros(len(values), dtype=np.uint8)
+        values, kind, enters, *problem.tables, tolerance, max_sweeps, stale
     )
     return FixedPoint(problem.unpadded(values), sweeps, updates, change, tolerance)
 
@@ -94,25 +98,35 @@ class _Problem:
             slice(g, g + count) for g, count in zip(self.feet.ghost, grid.shape, strict=True)
         )
 
-    def start(self, upper_bound: Floats | None) -> tuple[Floats, NDArray[np.bool_]]:
-        """Padded flat values to start from, and which of them are final."""
-        query, grid = self.query, self.grid
+    def start(self, upper_bound: Floats | None) -> tuple[Floats, Ints, NDArray[np.bool_]]:
+        """Padded flat values to start from, what to do with each node, and a table for that.
+
+        A motion that enters the goal ends at the first hit, so its cost is not one up to its foot:
+        near the goal such motions are taken care of by the start values, and their feet do not
+        count. A node is `FIXED`, `PLAIN`, or the row of `enters` `[near, J]` that says which feet
+        lie in the goal.
+        """
+        query, grid, feet = self.query, self.grid, self.feet
         nodes = grid.nodes()
         distance = query.goal_distance(nodes)
         values = np.where(distance <= 0, 0.0, np.inf)
-        cells = float(self.feet.reach)
-        near = (distance > 0) & (distance < cells * grid.spacing[list(query.system.position)].max())
+        h = grid.spacing[list(query.system.position)]
+        near = (distance > 0) & (distance < feet.reach * np.linalg.norm(h))
+        index = np.argwhere(near) * (feet.shape > 1)
+        ends = nodes[near][:, None] + feet.foot[index @ flat_strides(feet.shape)] * grid.spacing
+        enters = query.goal_distance(ends) <= 1e-9  # metres, so that rounding decides nothing
         if near.any():
-            values[near] = arrival_costs(query, grid, nodes[near], cells)
+            values[near] = arrival_costs(query, grid, nodes[near], float(feet.reach))
         if upper_bound is not None:
             if upper_bound.shape != grid.shape:
                 raise ValueError(f"upper_bound: needs shape {grid.shape}, got {upper_bound.shape}")
             values = np.fmin(values, upper_bound)
-        fixed = distance <= 0
+        kind = np.where(distance <= 0, FIXED, PLAIN)
+        kind[near] = np.arange(len(enters))
         if query.hard_obstacles:
             blocked = query.clearance(nodes, hard_only=True) < 0
             values[blocked] = np.inf
-            fixed |= blocked
+            kind[blocked] = FIXED
         if not np.isfinite(values).any():
             raise ValueError(
                 f"grid.shape: {grid.shape} is too coarse for any node to meet the goal of radius "
@@ -120,9 +134,9 @@ class _Problem:
             )
         padded = np.full(self.shape, np.inf)
         padded[self.core] = values
-        final = np.ones(self.shape, dtype=bool)
-        final[self.core] = fixed
-        return padded.ravel(), final.ravel()
+        kinds = np.full(self.shape, FIXED)
+        kinds[self.core] = kind
+        return padded.ravel(), kinds.ravel(), enters
 
     def unpadded(self, values: Floats) -> Floats:
         return np.ascontiguousarray(values.reshape(self.shape)[self.core])
@@ -134,11 +148,13 @@ class _Problem:
         system = query.system
         n = system.n
         depends = _cost_axes(system, replace(query.cost, goal=1.0))
-        offset, weight, own = cost_stencil(feet, grid, tuple(map(bool, depends)))
-        ghost = np.where(depends, feet.ghost, 0)
+        finer = COST_FINER if depends.sum() <= 3 else 1
+        offset, weight, own = cost_stencil(feet, grid, tuple(map(bool, depends)), finer)
+        ghost = np.where(depends, finer * feet.ghost, 0)
         center = (np.array(grid.lower) + grid.upper) / 2
+        last = finer * (np.array(grid.shape) - 1) + (finer - 1) * np.array(grid.periodic)
         axes = [
-            grid.lower[i] + grid.spacing[i] * np.arange(-ghost[i], grid.shape[i] + ghost[i])
+            grid.lower[i] + grid.spacing[i] / finer * np.arange(-ghost[i], last[i] + ghost[i] + 1)
             if depends[i]
             else center[i : i + 1]
             for i in range(n)
@@ -151,13 +167,15 @@ class _Problem:
             np.array(grid.shape),
             flat_strides(self.shape),
             flat_strides(feet.shape) * (feet.shape > 1),
-            flat_strides(np.array(states.shape[:-1])) * depends,
+            flat_strides(np.array(states.shape[:-1])) * depends * finer,
             flat_strides(position_shape) * (np.arange(n) < d),
         ]
         layout = np.ones((len(rows), MAX_DIMENSION), dtype=np.int64)
         layout[1:] = 0
         layout[:, MAX_DIMENSION - n :] = rows
-        first = np.array([feet.ghost @ rows[1], ghost @ rows[3]])  # flat index of the first node
+        first = np.array(
+            [feet.ghost @ rows[1], feet.ghost @ rows[3]]
+        )  # flat index of the first node
         blocked, blocking = self._obstacles()
         return (
             layout, first, feet.node_offset, feet.node_weight, slowness, offset, weight, own,
@@ -209,8 +227,8 @@ def _mean(c, g, j, slowness, cost_offset, cost_weight, own):
 
 @inlined
 def _update(
-    node, c, g, shut, values, node_offset, node_weight, slowness, cost_offset, cost_weight,
-    own, length, pairs, pair_geometry, faces, face_geometry, blocking, foot, cost,
+    node, c, g, kind, enters, shut, values, node_offset, node_weight, slowness, cost_offset,
+    cost_weight, own, length, pairs, pair_geometry, faces, face_geometry, blocking, foot, cost,
 ):  # fmt: skip
     """The scheme's right side at one node, if it is below the node's value, else that value.
 
@@ -222,7 +240,7 @@ def _update(
         value = 0.0
         for k in range(node_offset.shape[2]):
             value += node_weight[g, j, k] * values[node + node_offset[g, j, k]]
-        if shut and shut & blocking[g, j]:
+        if (shut and shut & blocking[g, j]) or (kind >= 0 and enters[kind, j]):
             value = np.inf
         foot[j] = value
         if value < best or faces.shape[0] > 0:
@@ -284,14 +302,14 @@ def _update(
 
 @compiled(
     types.Tuple((types.int64, types.int64, float64))(
-        F1, _array(types.boolean, 1), I2, I1, I3, F3, F1, I3, F3, F2,
+        F1, I1, _array(types.boolean, 2), I2, I1, I3, F3, F1, I3, F3, F2,
         F2, I2, F3, I2, F4, I1, I2, I2, I1, float64, types.int64, _array(types.uint8, 1),
     )
 )  # fmt: skip
 def _sweeps(
-    values, final, layout, first, node_offset, node_weight, slowness, cost_offset, cost_weight, own,
-    length, pairs, pair_geometry, faces, face_geometry, blocked, blocking, readers, reader_count,
-    tolerance, max_sweeps, stale,
+    values, kind, enters, layout, first, node_offset, node_weight, slowness, cost_offset,
+    cost_weight, own, length, pairs, pair_geometry, faces, face_geometry, blocked, blocking,
+    readers, reader_count, tolerance, max_sweeps, stale,
 ):  # fmt: skip
     """Gauss-Seidel sweeps in alternating orders until nothing changes: sweeps, updates, change.
 
@@ -328,7 +346,7 @@ def _sweeps(
                                     stale[node + readers[g, r]] = 1
                             continue
                         stale[node] = 0
-                        if final[node]:
+                        if kind[node] == FIXED:
                             continue
                         c = (
                             first[1] + i0 * cost_strides[0] + i1 * cost_strides[1]
@@ -340,8 +358,8 @@ def _sweeps(
                                 i0 * place[0] + i1 * place[1] + i2 * place[2] + i3 * place[3]
                             ]
                         new = _update(
-                            node, c, g, shut, values, node_offset, node_weight, slowness,
-                            cost_offset, cost_weight, own, length, pairs, pair_geometry,
+                            node, c, g, kind[node], enters, shut, values, node_offset, node_weight,
+                            slowness, cost_offset, cost_weight, own, length, pairs, pair_geometry,
                             faces, face_geometry, blocking, foot, cost,
                         )  # fmt: skip
                         updates += 1

@@ -298,6 +298,7 @@ def shoot(
         for k in range(1, count):
             scale[i] += abs(nodes[k, i]) / count
     scale[2 * n] += duration
+    on_manifold = terminal_at(functions[4, 0], functions[4, 1])
     damping, previous, previous_simplified = 1.0, 0.0, 0.0
     size = np.inf
     for iteration in range(int(settings[2])):
@@ -323,9 +324,17 @@ def shoot(
             difference = math.sqrt(difference / step.size)
             if difference > 0.0:
                 damping = min(1.0, damping * previous * previous_simplified / (difference * size))
-        final = size <= settings[0]
-        if final:
-            damping = 1.0
+        if size <= settings[0]:
+            for k in range(1, count):
+                for i in range(2 * n):
+                    nodes[k, i] += step[k, i]
+            for i in range(n):
+                for c in range(free):
+                    end[i] += edge[i, c] * ends[c]
+            duration += ends[n - 1] if free_time else 0.0
+            if not on_manifold(kind, functions, q, layout, terms, end, nodes[count], edge):
+                return BROKEN, iteration, duration, size
+            return CONVERGED, iteration + 1, duration, size
         reduced = False
         while True:
             if damping < settings[3]:
@@ -359,8 +368,6 @@ def shoot(
                 reduced = True
                 continue
             correction = _norm(simplified, scale)
-            if final:
-                break
             difference = 0.0
             for k in range(count + 1):
                 for i in range(2 * n + 1):
@@ -381,8 +388,6 @@ def shoot(
         end[:] = trial_end
         duration = longer
         previous, previous_simplified = size, correction
-        if final:
-            return CONVERGED, iteration + 1, duration, correction
     return ITERATIONS, int(settings[2]), duration, size
 
 

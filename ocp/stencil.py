@@ -46,7 +46,7 @@ class Stencil:
         node_offset, node_weight: `[g, J, C]`, flat offsets of the nodes around a foot; the weights
             are infinite (the foot's value is, too) where an input does not move the robot.
         corners: `[g, J, C, n]`, the same in cells, not wrapped.
-        middle_corners, middle_weight: of the half-way points, likewise.
+        foot, middle: `[g, J, n]`, in cells, where motions end and are half-way.
         readers, reader_count: `[g, K]`, `[g]`: flat offsets of the nodes with a foot beside a node.
         pairs: `[P, 2]`, neighbouring directions.
         pair_geometry: `[g, P, 5]`, see `_pair_geometry`.
@@ -63,8 +63,8 @@ class Stencil:
     node_offset: Ints
     node_weight: Floats
     corners: Ints
-    middle_corners: Ints
-    middle_weight: Floats
+    foot: Floats
+    middle: Floats
     readers: Ints
     reader_count: Ints
     pairs: Ints
@@ -128,16 +128,12 @@ def _stencil(key: _Key, grid: Grid, directions: int, reach: int) -> Stencil:
     inputs = np.tile(units / np.sqrt(query.input_weights), (len(base), 1))
     length, cells, middle = _motions(query, grid, starts, inputs, np.tile(reaches, len(base)))
 
-    def table(offsets: Floats) -> tuple[Ints, Floats]:
-        corners, weight = _around(offsets)
-        return corners.reshape(-1, J, *corners.shape[1:]), weight.reshape(-1, J, weight.shape[1])
-
     stuck = np.isinf(cells).sum(axis=1) > 0
-    corners, node_weight = table(np.where(stuck[:, None], 0.0, cells))
+    cells = np.where(stuck[:, None], 0.0, cells).reshape(-1, J, n)
+    corners, node_weight = _around(cells)
     node_weight[stuck.reshape(-1, J)] = np.inf
-    middle_corners, middle_weight = table(middle)
     ghost = np.where(periodic, 0, reach)
-    there = _wrapped(index, corners, grid)
+    there = _wrapped(index, corners, grid.shape, periodic)
     node_offset = (there - index[:, None, None]) @ flat_strides(np.array(grid.shape) + 2 * ghost)
     target = np.where(depends, there, 0)
     outside = np.any((target < 0) | (target >= shape), axis=-1)
@@ -149,36 +145,44 @@ def _stencil(key: _Key, grid: Grid, directions: int, reach: int) -> Stencil:
     faces, face_geometry = _faces(motions, larger, system.m)
     return Stencil(
         reach, ghost, shape, index, units, length.reshape(-1, J), node_offset, node_weight, corners,
-        middle_corners, middle_weight, readers, reader_count,
+        cells, middle.reshape(-1, J, n), readers, reader_count,
         pairs, _pair_geometry(motions, pairs), faces, face_geometry,
     )  # fmt: skip
 
 
 @lru_cache(maxsize=8)
 def cost_stencil(
-    feet: Stencil, grid: Grid, depends: tuple[bool, ...]
+    feet: Stencil, grid: Grid, depends: tuple[bool, ...], finer: int
 ) -> tuple[Ints, Floats, Floats]:
-    """Simpson's rule along each motion, for a cost on the sub-grid of the axes in `depends`.
+    """Simpson's rule along each motion, for a cost on a grid of its own.
+
+    That grid has the axes in `depends` alone, `finer` of its cells to one of `grid`, and as many
+    ghost layers in length.
 
     Returns:
-        `[g, J, E]` flat offsets into that sub-grid with its ghost layers, `[g, J, E]` weights, and
-        `[g, J]` the weight of the start.
+        `[g, J, E]` flat offsets from a node of `grid`, `[g, J, E]` weights, and `[g, J]` the weight
+        of the node itself.
     """
-    padded = np.where(depends, np.array(grid.shape) + 2 * feet.ghost, 1)
-    strides = flat_strides(padded) * depends
-    corners = np.concatenate([feet.corners, feet.middle_corners], axis=2)
-    weight = np.concatenate([feet.node_weight / 6, feet.middle_weight * 4 / 6], axis=2)
-    weight[~np.isfinite(weight)] = 0.0
-    there = _wrapped(feet.index, corners, grid)
-    offset = (there - feet.index[:, None, None]) @ strides
-    rows = np.broadcast_to(
-        np.arange(weight[..., 0].size).reshape(*weight.shape[:2], 1), weight.shape
+    periodic = np.array(grid.periodic)
+    cells = finer * (np.array(grid.shape) - 1 + periodic)
+    shape = np.where(depends, cells + 1 - periodic + 2 * finer * feet.ghost, 1)
+    fine = np.where(depends, finer, 0)
+    (foot, foot_weight), (middle, middle_weight) = (
+        _around(feet.foot * fine),
+        _around(feet.middle * fine),
     )
-    merged, weights, _ = _packed(rows.ravel(), offset.ravel(), weight.ravel())
-    shape = (*weight.shape[:2], -1)
+    corners = np.concatenate([foot, middle], axis=2)
+    weight = np.concatenate([foot_weight / 6, middle_weight * 4 / 6], axis=2)
+    here = feet.index * fine
+    there = _wrapped(here, corners, shape, periodic)
+    offset = (there - here[:, None, None]) @ (flat_strides(shape) * depends)
+    count = weight.shape[0] * weight.shape[1]
+    rows = np.repeat(np.arange(count), weight.shape[2])
+    merged, weights, _ = _packed(rows, offset.ravel(), weight.ravel())
     own = np.where(merged == 0, weights, 0.0).sum(axis=1)
     weights = np.where(merged == 0, 0.0, weights)
-    return merged.reshape(shape), weights.reshape(shape), (own + 1 / 6).reshape(shape[:2])
+    packed = (*weight.shape[:2], -1)
+    return merged.reshape(packed), weights.reshape(packed), (own + 1 / 6).reshape(packed[:2])
 
 
 def coordinates_in(expression: ca.SX, state: ca.SX) -> NDArray[np.bool_]:
@@ -248,21 +252,23 @@ def _flow(query: Query, states: Floats, inputs: Floats, lengths: Floats) -> Floa
 
 
 def _around(cells: Floats) -> tuple[Ints, Floats]:
-    """Nodes around points given in cells `[r, n]`: offsets `[r, C, n]` and weights `[r, C]`.
+    """Nodes around points given in cells `[..., n]`: offsets `[..., C, n]` and weights `[..., C]`.
 
     Nodes of weight 0 are left out; where fewer than C remain, the first is repeated with weight 0.
     """
+    shape, n = cells.shape[:-1], cells.shape[-1]
+    cells = cells.reshape(-1, n)
     nearest = np.round(cells)
     cells = np.where(abs(cells - nearest) < ON_NODE, nearest, cells)
     low = np.floor(cells)
     fraction = (cells - low)[:, None, :]
-    sides = np.array(list(product((0, 1), repeat=cells.shape[1])))
+    sides = np.array(list(product((0, 1), repeat=n)))
     weight = np.where(sides, fraction, 1.0 - fraction).prod(axis=2)
     order = np.argsort(weight <= 0.0, axis=1, kind="stable")[:, : (weight > 0.0).sum(axis=1).max()]
     weight = np.take_along_axis(weight, order, axis=1)
     corners = low[:, None, :].astype(np.int64) + sides[order]
     corners = np.where(weight[..., None] > 0.0, corners, corners[:, :1])
-    return corners, weight
+    return corners.reshape(*shape, -1, n), weight.reshape(*shape, -1)
 
 
 def flat_strides(shape: Ints) -> Ints:
@@ -270,10 +276,12 @@ def flat_strides(shape: Ints) -> Ints:
     return np.append(np.cumprod(shape[:0:-1])[::-1], 1).astype(np.int64)
 
 
-def _wrapped(index: Ints, corners: Ints, grid: Grid) -> Ints:
+def _wrapped(
+    index: Ints, corners: Ints, shape: Ints | tuple[int, ...], periodic: NDArray[np.bool_]
+) -> Ints:
     """Indices `[g, J, C, n]` of corners, wrapped round the periodic axes."""
     there = index[:, None, None, :] + corners
-    return np.where(grid.periodic, there % grid.shape, there)
+    return np.where(periodic, there % shape, there)
 
 
 def _packed(rows: Ints, keys: Ints, weights: Floats) -> tuple[Ints, Floats, Ints]:

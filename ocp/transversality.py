@@ -9,10 +9,12 @@ H = w instead of 0, and costs of the order of w^1.5 too much.
 """
 
 import math
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import int64, types
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ocp.batch import state_costs
 from ocp.function_address import ADDRESSES, function_at
@@ -24,27 +26,48 @@ GOAL_AT_REST, GOAL_PUSHED, QUADRATIC = 0, 1, 2
 
 NEGLIGIBLE = 1e-8  # running cost on the goal's boundary; see above
 # Just outside the goal, so that rounding cannot put the end where the goal cost is cut off.
-BOUNDARY = 1.0 + 1e-9
+BOUNDARY = 1.0 + 1e-11
 
 kernel_at = function_at(KERNEL)
 scalar_at = function_at(SCALAR)
 
 
-def goal_condition(query: Query) -> int:
-    """GOAL_AT_REST where it applies, else GOAL_PUSHED."""
+@dataclass(frozen=True)
+class Condition:
+    """How extremals end.
+
+    Attributes:
+        kind: GOAL_AT_REST, GOAL_PUSHED or QUADRATIC.
+        terms: the `terms` of `terminal_point`.
+    """
+
+    kind: int
+    terms: NDArray[np.float64]
+
+    @property
+    def at_goal(self) -> bool:
+        """Whether the motion ends on the goal's boundary, at a free time; else at a fixed time."""
+        return self.kind != QUADRATIC
+
+
+@lru_cache(maxsize=1024)
+def goal_condition(query: Query) -> Condition:
+    """On the goal's boundary: at rest where that is good enough, else pushed."""
+    terms = np.array([*query.goal.center, query.goal.radius])
     lower, upper = query.input_bounds
-    if query.system.has_drift or query.cost.state is not None or (lower > 0).any():
-        return GOAL_PUSHED
-    if (upper < 0).any():
-        return GOAL_PUSHED
-    states = np.zeros((512, query.system.n))
-    states[:, : len(query.goal.center)] = goal_boundary(query, 512)
-    return GOAL_AT_REST if state_costs(query, states).max() < NEGLIGIBLE else GOAL_PUSHED
+    can_rest = not query.system.has_drift and (lower <= 0).all() and (upper >= 0).all()
+    if can_rest and query.cost.state is None:
+        states = np.zeros((512, query.system.n))
+        states[:, : len(query.goal.center)] = goal_boundary(query, 512)
+        if state_costs(query, states).max() < NEGLIGIBLE:
+            return Condition(GOAL_AT_REST, terms)
+    return Condition(GOAL_PUSHED, terms)
 
 
-def goal_terms(query: Query) -> NDArray[np.float64]:
-    """The `terms` of `terminal_point` for the goal."""
-    return np.array([*query.goal.center, query.goal.radius])
+def quadratic_condition(reference: ArrayLike, matrix: ArrayLike) -> Condition:
+    """Anywhere, at the terminal cost (x - c)' P (x - c): c `[n]`, P `[n, n]` symmetric."""
+    terms = np.concatenate([np.ravel(reference), np.ravel(matrix)]).astype(float)
+    return Condition(QUADRATIC, terms)
 
 
 def goal_boundary(query: Query, count: int) -> NDArray[np.float64]:

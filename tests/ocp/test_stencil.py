@@ -26,12 +26,13 @@ def test_feet_are_the_ends_of_motions(model: str, reach: int) -> None:
     """Each lies on a face of the box of `reach` cells (one cell along a single input) and is the
     mean of its corners; a straight motion's length is its displacement's in the R-norm."""
     query, _, feet = made(model, reach)
-    foot = (feet.node_weight[..., None] * feet.corners).sum(axis=2)
+    mean = (feet.node_weight[..., None] * feet.corners).sum(axis=2)
+    np.testing.assert_allclose(mean, feet.foot, atol=1e-6)
     np.testing.assert_allclose(feet.node_weight.sum(axis=2), 1.0, atol=1e-12)
     longest = np.full(len(feet.directions), float(reach))
     if reach > 1:
         longest[-2 * query.system.m :] = 1.0
-    np.testing.assert_allclose(abs(foot).max(axis=2), np.broadcast_to(longest, foot.shape[:2]))
+    np.testing.assert_allclose(abs(mean).max(axis=2), np.broadcast_to(longest, mean.shape[:2]))
 
 
 def test_unicycle_feet_are_arcs() -> None:
@@ -39,7 +40,7 @@ def test_unicycle_feet_are_arcs() -> None:
     query = Query("unicycle", Goal((1.0, 1.0), 0.5))
     grid = Grid.for_query(query, 9000)
     feet = stencil(query, grid, 16, 2)
-    foot = (feet.node_weight[..., None] * feet.corners).sum(axis=2) * grid.spacing
+    foot = feet.foot * grid.spacing
     v, w = feet.directions.T
     s = feet.length
     half_turn = w * s / 2
@@ -70,16 +71,16 @@ def test_readers_are_the_nodes_with_a_foot_beside(model: str) -> None:
     assert listed == reads
 
 
+@pytest.mark.parametrize("finer", [1, 2])
 @pytest.mark.parametrize("model", MODELS)
-def test_the_cost_along_a_motion_is_exact_for_linear_costs(model: str) -> None:
+def test_the_cost_along_a_motion_is_exact_for_linear_costs(model: str, finer: int) -> None:
     """Simpson's rule and linear interpolation both are, on straight motions."""
     _, grid, feet = made(model, 1)
     axes = (True,) + (False,) * (grid.dimension - 1)
-    offset, weight, own = cost_stencil(feet, grid, axes)
-    mean = (weight * offset).sum(axis=2)  # of the first coordinate in cells, 0 at the start
-    half = (feet.middle_weight[..., None] * feet.middle_corners).sum(axis=2)[..., 0]
-    end = (feet.node_weight[..., None] * feet.corners).sum(axis=2)[..., 0]
-    np.testing.assert_allclose(mean, (4 * half + end) / 6, atol=1e-12)
+    offset, weight, own = cost_stencil(feet, grid, axes, finer)
+    mean = (weight * offset).sum(axis=2) / finer  # the first coordinate in cells, 0 at the start
+    expected = (4 * feet.middle[..., 0] + feet.foot[..., 0]) / 6
+    np.testing.assert_allclose(mean, expected, atol=1e-6)
     np.testing.assert_allclose(weight.sum(axis=2) + own, 1.0, atol=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""A world of balls in any number of dimensions, in closed form: what a user's own world looks like."""
+"""A world of balls in any number of dimensions, in closed form."""
 
 from collections.abc import Sequence
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ball_world import BallWorld
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from ball_world import BallWorld
 from oracles import check_costs, check_tree, clearance_by_search, costs_by_dijkstra
 
 from ocp.obstacle import Obstacle
@@ -16,6 +16,7 @@ from planners.blockage import Barrier
 from planners.rrtx import RRTX, Cause
 from planners.solids import Solid
 from planners.world import SceneWorld
+from sims.benchmarks.visibility_graph import shortest_way
 
 SIDE = 10.0
 
@@ -98,8 +99,8 @@ def test_a_long_fuzz_in_space() -> None:
 
 def test_a_long_fuzz_in_the_plane() -> None:
     rng = np.random.default_rng(2)
-    tree = planner(800, obstacles=8, seed=2)
-    for _ in range(150):
+    tree = planner(500, obstacles=8, seed=2)
+    for _ in range(100):
         random_change(tree, rng)
         check_costs(tree)
 
@@ -280,13 +281,28 @@ def test_more_samples_shorten_the_way() -> None:
     assert costs[-1] < costs[0]
 
 
+def test_the_shortened_route_leaves_out_corners_only_where_that_is_free() -> None:
+    tree = planner(1500, obstacles=0, padding=0.2)
+    tree.change(add=[Solid.ball([-2, -1], 2.0), Solid.box([1, 2], [4, 6])])
+    short, route = tree.shortened(), tree.route
+    assert short.cost < route.cost
+    assert {tuple(p) for p in short.points} <= {tuple(p) for p in route.points}
+    assert short.points[[0, -1]].tolist() == route.points[[0, -1]].tolist()
+    assert tree.world.certify(short.points[:-1], short.points[1:], 0.2).all()
+    assert isinstance(tree.world, SceneWorld)
+    # No way is shorter than the optimum.
+    best, _ = shortest_way(tree.world.obstacles.values(), tree.robot, tree.goal, 0.2)
+    assert best < short.cost < 1.02 * best
+
+
 def test_a_tree_of_samples_added_late_equals_one_grown_at_once() -> None:
     late, once = planner(50, seed=6), planner(250, seed=6)
     late.appear(Solid.ball([0, 0], 1.0))
     for _ in range(4):
         late.grow(50)
     once.appear(Solid.ball([0, 0], 1.0))
-    late.settle(), once.settle()
+    late.settle()
+    once.settle()
     assert np.array_equal(late.view().cost_to_go, once.view().cost_to_go)
 
 
@@ -375,6 +391,6 @@ def test_bad_changes_are_refused_and_leave_the_tree_in_order(change: dict, messa
 )
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
     world = SceneWorld([-SIDE] * 2, [SIDE] * 2)
+    merged: dict[str, Any] = {"goal": [9, 9], "robot": [0, 0]} | options
     with pytest.raises(ValueError, match=message):
-        merged: dict[str, Any] = {"goal": [9, 9], "robot": [0, 0]} | options
         RRTX(world, **merged)

@@ -1,0 +1,110 @@
+"""OMPL's planners from scratch on our worlds, with our certificates as their validity oracle."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from planners.world import World
+
+PEERS = ("RRTstar", "InformedRRTstar", "BITstar", "AORRTC")
+
+
+class PeersMissingError(RuntimeError):
+    """OMPL is not installed."""
+
+
+@dataclass(frozen=True)
+class PeerRun:
+    """What a peer did.
+
+    Attributes:
+        seconds: until the cost was reached, or until it was stopped.
+        cost: of the way found; infinite if none.
+        reached: whether the cost asked for was reached.
+    """
+
+    seconds: float
+    cost: float
+    reached: bool
+
+
+def run_peer(
+    name: str,
+    world: World,
+    start: Sequence[float],
+    goal: Sequence[float],
+    padding: float,
+    target: float,
+    limit: float,
+    seed: int,
+) -> PeerRun:
+    """Plan from scratch until a way no longer than `target` is found, or `limit` seconds passed.
+
+    Raises:
+        PeersMissingError: if OMPL cannot be imported.
+    """
+    try:
+        from ompl import base, geometric
+    except ImportError as error:
+        raise PeersMissingError(
+            "the peers need OMPL, which is optional: pip install 'ompl==2.0.1'"
+        ) from error
+    _seed_once(seed)
+    d = world.dimension
+    space = base.RealVectorStateSpace(d)
+    bounds = base.RealVectorBounds(d)
+    for k in range(d):
+        bounds.setLow(k, float(world.lower[k]))
+        bounds.setHigh(k, float(world.upper[k]))
+    space.setBounds(bounds)
+    information = base.SpaceInformation(space)
+
+    def point(state) -> np.ndarray:
+        return np.array([[state[k] for k in range(d)]])
+
+    class Certified(base.MotionValidator):
+        def checkMotion(self, first, second, *_) -> bool:
+            return bool(world.certify(point(first), point(second), padding)[0])
+
+    def valid(state) -> bool:
+        here = point(state)
+        return bool(world.certify(here, here, padding)[0])
+
+    def state(values: Sequence[float]):
+        made = space.allocState()
+        for k in range(d):
+            made[k] = float(values[k])
+        return made
+
+    validator = Certified(information)
+    information.setStateValidityChecker(valid)
+    information.setMotionValidator(validator)
+    information.setup()
+    problem = base.ProblemDefinition(information)
+    problem.setStartAndGoalStates(state(start), state(goal), 1e-6)
+    objective = base.PathLengthOptimizationObjective(information)
+    objective.setCostThreshold(base.Cost(target))
+    problem.setOptimizationObjective(objective)
+    planner = getattr(geometric, name)(information)
+    planner.setProblemDefinition(problem)
+    planner.setup()
+    begun = time.perf_counter()
+    planner.solve(base.timedPlannerTerminationCondition(limit))
+    seconds = time.perf_counter() - begun
+    cost = math.inf
+    if problem.hasExactSolution():
+        cost = float(problem.getSolutionPath().length())
+    return PeerRun(seconds, cost, cost <= target * (1 + 1e-9))
+
+
+@cache
+def _seed_once(seed: int) -> None:
+    """OMPL takes a seed once in a process, and none of 0."""
+    from ompl import util
+
+    util.setLogLevel(util.LOG_ERROR)
+    util.RNG.setSeed(seed + 1)
