@@ -226,18 +226,19 @@ class _Search:
             if self.horizon is not None or motion.duration < 0.99 * cap:
                 return motion
             cap *= CAP
-        raise SolveError(
-            Status.NOT_CONVERGED,
-            f"the duration grows without bound, beyond {cap / CAP:.3g} s: is there any cost of "
-            "being away from the goal? Otherwise give a horizon",
-        )
+        raise _unbounded(cap / CAP)
 
     def _tight(self, loose: CollocatedMotion, margin: float) -> CollocatedMotion:
         """The answer proper: from a loose one, with a negligible price of time."""
         if self.horizon is not None:
             return loose
-        problem = self._problem(loose.mesh, CAP * loose.duration, margin)
-        return self._program(len(loose.durations)).solve(problem, loose, TIME_PRICE, self.deadline)
+        cap = CAP * loose.duration
+        problem = self._problem(loose.mesh, cap, margin)
+        ready = self._program(len(loose.durations))
+        motion = ready.solve(problem, loose, TIME_PRICE, self.deadline)
+        if motion.duration > 0.99 * cap:
+            raise _unbounded(cap)
+        return motion
 
     def _refined(self, loose: CollocatedMotion) -> CollocatedMotion:
         """Refine mesh and margin until a replay agrees and is clear of hard obstacles."""
@@ -314,6 +315,14 @@ def _until(guess: Trajectory, end: float) -> Trajectory:
         inputs=cut(guess.inputs),
         costates=None,
         cost_so_far=cut(guess.cost_so_far)[:, 0],
+    )
+
+
+def _unbounded(duration: float) -> SolveError:
+    return SolveError(
+        Status.NOT_CONVERGED,
+        f"the duration grows without bound, beyond {duration:.3g} s: does it cost anything to be "
+        "away from the goal? If not, give a horizon",
     )
 
 

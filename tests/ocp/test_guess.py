@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from references import ALL_QUERIES, typical_query
 
 from ocp.guess import default_guesses
 from ocp.obstacle import Obstacle
 from ocp.query import Goal, Query
 from ocp.query_family import paper_query
-from tests.references import ALL_QUERIES, typical_query
 
 START = np.array([-4.0, -4.0, -np.pi / 4])
 
