@@ -1,6 +1,7 @@
 """Figures of RRT^X in the plane: tree, route, padded obstacles, cost-to-go behind them."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -8,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from ocp.files import atomic_path
 from planners.rrtx import RRTX
@@ -18,11 +20,13 @@ ROUTE = "#D55E00"
 ROBOT = "#FFFFFF"
 GOAL = "#009E73"
 SOLID = "#3A3A3A"
-PADDING = "#8C8C8C"
+PADDING = "#C8C8C8"
 
 
 def draw_planner(axes: Axes, planner: RRTX, resolution: int = 160, colourbar: bool = True) -> None:
     """Draw the planner's tree, route and obstacles over the interpolated cost-to-go.
+
+    The tree is repaired to its end first.
 
     Args:
         axes: where to draw.
@@ -37,10 +41,19 @@ def draw_planner(axes: Axes, planner: RRTX, resolution: int = 160, colourbar: bo
     if not isinstance(world, SceneWorld) or world.dimension != 2:
         raise ValueError("figure: the planner does not plan in the plane")
     (left, bottom), (right, top) = world.lower, world.upper
+    planner.settle()
     x = np.linspace(left, right, resolution)
     y = np.linspace(bottom, top, resolution)
-    cost = planner.cost_to_go(np.stack(np.meshgrid(x, y), axis=-1))
-    shown = np.ma.masked_invalid(cost)
+    points = np.stack(np.meshgrid(x, y), axis=-1)
+    cost = planner.cost_to_go(points)
+    # Under the padding, which is painted over them, colours go on to the edge of the paint.
+    margin = planner.padding + float(x[1] - x[0])
+    near = np.isfinite(world.distances(points, margin).distance)
+    nearest: Any = distance_transform_edt(
+        ~np.isfinite(cost), return_distances=False, return_indices=True
+    )
+    filled = np.where(near & np.isinf(cost), cost[tuple(nearest)], cost)
+    shown = np.ma.masked_invalid(filled)
     colours = axes.pcolormesh(x, y, shown, cmap="viridis", shading="gouraud", zorder=0)
     if colourbar:
         axes.figure.colorbar(colours, ax=axes, label="cost-to-go, m", shrink=0.85, pad=0.02)
@@ -55,17 +68,15 @@ def draw_planner(axes: Axes, planner: RRTX, resolution: int = 160, colourbar: bo
             axes.add_patch(
                 Polygon(
                     padded_outline(solid, planner.padding),
-                    facecolor="none",
-                    edgecolor=PADDING,
-                    linewidth=0.9,
-                    linestyle=(0, (4, 2)),
-                    zorder=3,
+                    color=PADDING,
+                    linewidth=0,
+                    zorder=2,
                 )
             )
         if solid.shape is Shape.BALL:
-            axes.add_patch(Circle(tuple(solid.center), solid.radius, color=SOLID, zorder=2, lw=0))
+            axes.add_patch(Circle(tuple(solid.center), solid.radius, color=SOLID, zorder=3, lw=0))
         else:
-            axes.add_patch(Polygon(solid.vertices, color=SOLID, zorder=2, lw=0))
+            axes.add_patch(Polygon(solid.vertices, color=SOLID, zorder=3, lw=0))
     update = planner.change()
     if update.route is not None:
         points = update.route.points

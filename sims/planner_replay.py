@@ -1,6 +1,7 @@
-"""A Meshcat replay of planning in a changing plane: obstacles, tree and route as they come and go."""
+"""A Meshcat replay of planning in a changing plane: obstacles, tree and route come and go."""
 
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -77,12 +78,17 @@ class PlannerReplay:
         meshcat.SetProperty("/Background", "bottom_color", [0.93, 0.95, 0.97])
         size, middle = upper - lower, (upper + lower) / 2
         meshcat.SetObject("floor", Box(size[0], size[1], 0.05), self._rgba(0.96, 0.96, 0.94))
-        meshcat.SetTransform("floor", RigidTransform([*middle, -0.05]))
+        meshcat.SetTransform("floor", RigidTransform(_at(middle, -0.05)))
         meshcat.SetObject("robot", Sphere(0.012 * size.max()), self._rgba(0.1, 0.1, 0.1))
         meshcat.SetObject("goal", Cylinder(0.012 * size.max(), 0.3), self._rgba(0, 0.62, 0.45))
-        meshcat.SetTransform("goal", RigidTransform([*self._planner.goal, 0.15]))
-        eye = [middle[0] + 0.1 * size[0], middle[1] - 0.75 * size[1], 0.95 * size.max()]
-        meshcat.SetCameraPose(np.array(eye), np.array([*middle, 0.0]))
+        meshcat.SetTransform("goal", RigidTransform(_at(self._planner.goal, 0.15)))
+        # Meshcat's point lights stand where they light a room, not a field: an even light instead.
+        for side in ("NegativeX", "PositiveX"):
+            meshcat.SetProperty(f"/Lights/PointLight{side}", "visible", False)
+        for light, intensity in (("Ambient", 2.0), ("Directional", 1.0), ("Fill", 0.6)):
+            meshcat.SetProperty(f"/Lights/{light}Light/<object>", "intensity", intensity)
+        eye = np.array([middle[0], middle[1] - 0.52 * size[1], 0.68 * size.max()])
+        meshcat.SetCameraPose(eye, np.array([middle[0], middle[1] - 0.04 * size[1], 0.0]))
 
     def _add_solid(self, path: str, solid: Solid, frame: int) -> None:
         from pydrake.math import RigidTransform, RotationMatrix
@@ -90,7 +96,7 @@ class PlannerReplay:
         rotation: Any = np.eye(3)
         rotation[:2, :2] = solid.rotation
         center: Any = np.array([*solid.center, HEIGHT / 2])
-        self._meshcat.SetObject(path, drake_shape(solid, HEIGHT), self._rgba(0.25, 0.33, 0.45, 1))
+        self._meshcat.SetObject(path, drake_shape(solid, HEIGHT), self._rgba(0.35, 0.43, 0.55, 1))
         self._meshcat.SetTransform(path, RigidTransform(RotationMatrix(rotation), center))
         self._appear(path, frame)
 
@@ -113,7 +119,7 @@ class PlannerReplay:
         child = np.flatnonzero(view.parent >= 0)
         starts = _lifted(view.points[child], 0.02)
         ends = _lifted(view.points[view.parent[child]], 0.02)
-        self._meshcat.SetLineSegments(path, starts, ends, 1.0, self._rgba(0.45, 0.6, 0.75))
+        self._meshcat.SetLineSegments(path, starts, ends, 1.0, self._rgba(0.25, 0.5, 0.75))
 
     def _draw_route(self, path: str) -> None:
         update = self._planner.change()
@@ -121,7 +127,7 @@ class PlannerReplay:
         # One line is one pixel wide in a browser: several side by side make a ribbon.
         across = np.linspace(-0.12, 0.12, 13)
         starts, ends = [], []
-        for a, b in zip(points[:-1], points[1:], strict=True):
+        for a, b in pairwise(points):
             normal = np.array([a[1] - b[1], b[0] - a[0]]) / np.linalg.norm(b - a)
             starts += [a + s * normal for s in across]
             ends += [b + s * normal for s in across]
@@ -132,7 +138,11 @@ class PlannerReplay:
     def _place(self, path: str, point: NDArray[np.float64], frame: int) -> None:
         from pydrake.math import RigidTransform
 
-        self._animation.SetTransform(frame, path, RigidTransform([*point, 0.3]))
+        self._animation.SetTransform(frame, path, RigidTransform(_at(point, 0.3)))
+
+
+def _at(point: NDArray[np.float64], height: float) -> Any:
+    return np.array([*point, height])
 
 
 def _lifted(points: NDArray[np.float64], height: float) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from rich.table import Table
 BENCHMARKS: dict[str, str] = {
     "exact": "exact costs, closed form, success and time of exact trajectories",
     "grids": "eikonal and set-valued grids: time, value error, closed-loop excess",
+    "rrtx": "RRT^X: repair after changes, against growth from scratch, OMPL and the optimum",
 }
 """Name of the module in this folder, and what it measures."""
 

@@ -2,11 +2,13 @@
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from planners.world import World
 
@@ -35,8 +37,8 @@ class PeerRun:
 def run_peer(
     name: str,
     world: World,
-    start: Sequence[float],
-    goal: Sequence[float],
+    start: ArrayLike,
+    goal: ArrayLike,
     padding: float,
     target: float,
     limit: float,
@@ -48,7 +50,8 @@ def run_peer(
         PeersMissingError: if OMPL cannot be imported.
     """
     try:
-        from ompl import base, geometric
+        base: Any = import_module("ompl.base")
+        geometric: Any = import_module("ompl.geometric")
     except ImportError as error:
         raise PeersMissingError(
             "the peers need OMPL, which is optional: pip install 'ompl==2.0.1'"
@@ -63,21 +66,21 @@ def run_peer(
     space.setBounds(bounds)
     information = base.SpaceInformation(space)
 
-    def point(state) -> np.ndarray:
+    def point(state: Any) -> np.ndarray:
         return np.array([[state[k] for k in range(d)]])
 
     class Certified(base.MotionValidator):
-        def checkMotion(self, first, second, *_) -> bool:
+        def checkMotion(self, first: Any, second: Any, *_: Any) -> bool:
             return bool(world.certify(point(first), point(second), padding)[0])
 
-    def valid(state) -> bool:
+    def valid(state: Any) -> bool:
         here = point(state)
         return bool(world.certify(here, here, padding)[0])
 
-    def state(values: Sequence[float]):
+    def state(values: ArrayLike) -> Any:
         made = space.allocState()
-        for k in range(d):
-            made[k] = float(values[k])
+        for k, value in enumerate(np.asarray(values, dtype=float)):
+            made[k] = float(value)
         return made
 
     validator = Certified(information)
@@ -104,7 +107,6 @@ def run_peer(
 @cache
 def _seed_once(seed: int) -> None:
     """OMPL takes a seed once in a process, and none of 0."""
-    from ompl import util
-
+    util: Any = import_module("ompl.util")
     util.setLogLevel(util.LOG_ERROR)
     util.RNG.setSeed(seed + 1)
