@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from ocp.function_address import ADDRESSES, addresses, function_at
 from ocp.grid import INTERPOLATION, Grid, interpolate
-from ocp.hard_obstacles import SEGMENT, clear_segment, hard_data, interpolate_visible
+from ocp.hard_obstacles import (
+    SEGMENT,
+    clear_segment,
+    hard_data,
+    interpolate_joined,
+    interpolate_visible,
+)
 from ocp.input_samples import sampled_inputs
 from ocp.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled, float64
 from ocp.kernels import kernels
@@ -43,10 +49,15 @@ bellman_at = function_at(BELLMAN)
 GAUSS = (0.21132486540518713, 0.7886751345948129)
 
 
-def bellman_addresses(query: Query) -> NDArray[np.intp]:
-    """The functions that `bellman` calls, and itself last, for this query."""
+def bellman_addresses(query: Query, for_scheme: bool = False) -> NDArray[np.intp]:
+    """The functions that `bellman` calls, and itself last, for this query.
+
+    Beside hard obstacles a scheme, whose values feed on each other, mixes values by
+    `interpolate_joined`, and a policy by `interpolate_visible`.
+    """
     k = kernels(query)
-    mixing = interpolate_visible if query.hard_obstacles else interpolate
+    beside = interpolate_joined if for_scheme else interpolate_visible
+    mixing = beside if query.hard_obstacles else interpolate
     return addresses([k.dynamics, k.state_cost, mixing, clear_segment, bellman])
 
 

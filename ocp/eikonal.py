@@ -5,11 +5,18 @@ schemes solve that: single-pass fast marching on Selling stencils, and semi-Lagr
 other query is solved by value iteration in time. The result says which scheme made it.
 """
 
+import time
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ocp.bellman import bellman_geometry
 from ocp.fixed_point import FixedPoint
 from ocp.grid import Grid, GridValue
+from ocp.hard_obstacles import interpolate_visible_rows
 from ocp.lookahead import LookaheadPolicy
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status
@@ -29,24 +36,81 @@ class Scheme(Enum):
 
 
 @dataclass(frozen=True, eq=False)
+class QueryValue:
+    """A grid's value that knows its query: 0 in the goal, not blurred by hard obstacles.
+
+    Attributes:
+        query: what was solved.
+        on_grid: the nodes' values. Beside a hard obstacle only the nodes that a state sees past it
+            are mixed, as the lookahead policy does.
+    """
+
+    query: Query
+    on_grid: GridValue
+
+    @property
+    def grid(self) -> Grid:
+        return self.on_grid.grid
+
+    def value(self, states: ArrayLike) -> NDArray[np.float64]:
+        """V `[...]` at states `[..., n]`; infinite outside the grid's box and in hard obstacles.
+
+        Raises:
+            ValueError: if a state is not finite or has the wrong length.
+        """
+        states = np.asarray(states, dtype=float)
+        values = self.on_grid.value(states)
+        if self.query.hard_obstacles:
+            rows = np.ascontiguousarray(states.reshape(-1, states.shape[-1]))
+            seen = np.empty(len(rows))
+            interpolate_visible_rows(self.on_grid.flat, self._geometry, rows, seen)
+            values = seen.reshape(values.shape)
+        return np.where(self.query.goal_distance(states) <= 0, 0.0, values)
+
+    def gradient(self, states: ArrayLike) -> NDArray[np.float64]:
+        """The gradient `[..., n]` of the interpolant at states `[..., n]`; 0 in the goal.
+
+        Raises:
+            ValueError: if a state is not finite or has the wrong length.
+        """
+        gradients = self.on_grid.gradient(states)
+        outside = self.query.goal_distance(states) > 0
+        return np.where(np.asarray(outside)[..., None], gradients, 0.0)
+
+    @cached_property
+    def _geometry(self) -> NDArray[np.float64]:
+        return bellman_geometry(self.query, self.grid)
+
+
+@dataclass(frozen=True, eq=False)
 class EikonalSolution:
     """A value on a grid.
 
     Attributes:
         query: what was solved.
         scheme: the scheme that solved it.
-        value: V; infinite at nodes from which no admissible motion reaches the goal.
+        value: V; infinite where no admissible motion reaches the goal.
         fixed_point: the iteration's own account.
+        seconds: how long it took, by the wall clock.
     """
 
     query: Query
     scheme: Scheme
-    value: GridValue
+    value: QueryValue
     fixed_point: FixedPoint
+    seconds: float
 
-    def policy(self) -> LookaheadPolicy:
-        """Feedback by interpolated one-step lookahead."""
-        return LookaheadPolicy(self.query, self.value)
+    @property
+    def grid(self) -> Grid:
+        return self.value.grid
+
+    @property
+    def status(self) -> Status:
+        return self.fixed_point.status
+
+    def policy(self, margin: float = 0.0) -> LookaheadPolicy:
+        """Feedback by interpolated one-step lookahead, `margin` metres clear of hard obstacles."""
+        return LookaheadPolicy(self.query, self.value.on_grid, margin)
 
 
 def default_scheme(query: Query) -> Scheme:
@@ -81,16 +145,20 @@ def solve_eikonal(
         raise SolveError(
             Status.NOT_APPLICABLE, f"{scheme.name} needs a robot without drift and input bounds"
         )
+    began = time.perf_counter()
     grid = grid or Grid.for_query(query, nodes)
     found = _solve(query, grid, scheme).checked()
-    return EikonalSolution(query, scheme, GridValue(grid, found.values), found)
+    seconds = time.perf_counter() - began
+    value = QueryValue(query, GridValue(grid, found.values))
+    return EikonalSolution(query, scheme, value, found, seconds)
 
 
 def _solve(query: Query, grid: Grid, scheme: Scheme) -> FixedPoint:
     if scheme is Scheme.FAST_MARCHING:
-        from ocp.fast_marching import march
+        from ocp.fast_marching import marched
 
-        return FixedPoint(march(query, grid), 1, grid.size, 0.0, 0.0)
+        answer = marched(query, grid)
+        return FixedPoint(answer.values, 1, len(answer.accepted), 0.0, 0.0)
     if scheme is Scheme.SEMI_LAGRANGIAN:
         from ocp.semi_lagrangian import sweep_time_free
 

@@ -94,15 +94,9 @@ def clear_segment(start, end, data):
     return 0.0
 
 
-@compiled(float64(VECTOR, VECTOR, VECTOR))
-def interpolate_visible(values, geometry, point):
-    """Multilinear value from the corners that `point` sees past hard obstacles.
-
-    As `grid.interpolate`, with `hard_data` appended to `geometry`. The weights of the corners that
-    are finite and joined to `point` by a clear segment are scaled to sum to 1, so that a point
-    beside an obstacle has a value and a wall thinner than a cell does not leak. Infinite outside
-    the box, inside an obstacle, and where no corner is left.
-    """
+@compiled(float64(VECTOR, VECTOR, VECTOR, types.boolean))
+def _mixed(values, geometry, point, strict):
+    """Multilinear value from the corners that `point` sees; if `strict`, it must see all."""
     n = point.shape[0]
     data = geometry[4 * n :]
     gap = clearance(point, data)
@@ -147,14 +141,35 @@ def interpolate_visible(values, geometry, point):
             w *= weight[2 * i + side]
             k += index[2 * i + side]
             target[i] = corner_point[side, i]
-        if (
-            w > EDGE_TOLERANCE
-            and math.isfinite(values[k])
-            and (not check or clear_segment(point, target, data) > 0.0)
-        ):
+        if w <= EDGE_TOLERANCE:
+            continue
+        if math.isfinite(values[k]) and (not check or clear_segment(point, target, data) > 0.0):
             total += w * values[k]
             weights += w
+        elif strict:
+            return np.inf
     return total / weights if weights > 0.0 else np.inf
+
+
+@compiled(float64(VECTOR, VECTOR, VECTOR))
+def interpolate_joined(values, geometry, point):
+    """Multilinear value at `point` `[n]` if all the corners that count are finite and joined to it
+    by clear segments, else infinite: what a scheme may use without leaking through an obstacle.
+
+    As `grid.interpolate`, with `hard_data` appended to `geometry`.
+    """
+    return _mixed(values, geometry, point, True)
+
+
+@compiled(float64(VECTOR, VECTOR, VECTOR))
+def interpolate_visible(values, geometry, point):
+    """As `interpolate_joined`, but from those corners alone that are finite and joined to `point`.
+
+    Their weights are scaled to sum to 1, so that a point beside an obstacle has a value; it may be
+    too low by the effort of crossing a cell. Infinite outside the box, inside an obstacle, and
+    where no corner is left.
+    """
+    return _mixed(values, geometry, point, False)
 
 
 @compiled(types.void(VECTOR, VECTOR, MATRIX, VECTOR))

@@ -74,9 +74,10 @@ def iterate_values(
         values[blocked] = np.inf
         fixed |= blocked
     candidates, spread = sampled_inputs(query)
+    functions = bellman_addresses(query, for_scheme=True)
     sweeps, updates, change = _iterate(
         nodes, values, np.full((grid.size, query.system.m), np.nan), fixed,
-        np.array(grid.shape), candidates, spread, bellman_addresses(query), parameters(query),
+        np.array(grid.shape), candidates, spread, functions, parameters(query),
         bellman_settings(query, CELLS), bellman_geometry(query, grid), tolerance, max_sweeps,
     )  # fmt: skip
     return FixedPoint(values.reshape(grid.shape), sweeps, updates, change, tolerance)

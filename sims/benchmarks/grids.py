@@ -11,12 +11,11 @@ from rich.console import Console
 from rich.table import Table
 
 from ocp.eikonal import Scheme, solve_eikonal
-from ocp.grid import GridValue
 from ocp.oracle import consult
 from ocp.query import Query
 from ocp.query_family import PAPER_FAMILY, PAPER_GOALS, PAPER_START, paper_query, sample_start
 from ocp.set_valued import Image, Method, SetValuedSettings, solve_set_valued
-from ocp.value import Policy
+from ocp.value import Policy, Value
 from sims.benchmarks import Report, median_seconds
 from sims.closed_loop import rollout
 
@@ -41,7 +40,7 @@ class Contender:
 
     name: str
     nodes: int
-    solve: Callable[[Query], tuple[GridValue, Policy]]
+    solve: Callable[[Query], tuple[Value, Policy]]
     repeats: int = 5
 
 
@@ -89,14 +88,14 @@ def _truths(seed: int) -> list[Truth]:
 
 def _contenders() -> list[Contender]:
     def eikonal(scheme: Scheme, nodes: int) -> Contender:
-        def solve(query: Query) -> tuple[GridValue, Policy]:
+        def solve(query: Query) -> tuple[Value, Policy]:
             solution = solve_eikonal(query, nodes=nodes, scheme=scheme)
             return solution.value, solution.policy()
 
         return Contender(scheme.name.lower().replace("_", " "), nodes, solve)
 
     def set_valued(name: str, method: Method, image: Image, repeats: int) -> Contender:
-        def solve(query: Query) -> tuple[GridValue, Policy]:
+        def solve(query: Query) -> tuple[Value, Policy]:
             solution = solve_set_valued(
                 query, settings=SetValuedSettings(image=image), method=method
             )

@@ -12,6 +12,7 @@ from ocp.hard_obstacles import (
     clear_segment,
     clearance,
     hard_data,
+    interpolate_joined,
     interpolate_visible,
 )
 from ocp.obstacle import Obstacle
@@ -90,6 +91,9 @@ def test_values_do_not_mix_through_a_wall() -> None:
     assert interpolate_visible(values, geometry, np.array([0.03, 0.3])) == pytest.approx(1.0)
     assert interpolate_visible(values, geometry, np.array([0.015, 0.3])) == np.inf
     assert interpolate_visible(values, geometry, np.array([5.1, 0.3])) == np.inf
+    for x in (0.005, 0.03):
+        assert interpolate_joined(values, geometry, np.array([x, 0.3])) == np.inf
+    assert interpolate_joined(values, geometry, np.array([0.7, 0.3])) == pytest.approx(1.0)
 
 
 def test_far_from_obstacles_interpolation_is_the_plain_one() -> None:
@@ -98,8 +102,9 @@ def test_far_from_obstacles_interpolation_is_the_plain_one() -> None:
     value = GridValue(grid, rng.random(grid.shape))
     states = rng.uniform((2.5, -1.0, -9.0), (5.0, 5.0, 9.0), (200, 3))
     geometry = bellman_geometry(QUERY, grid)
-    found = [interpolate_visible(value.flat, geometry, x) for x in states]
-    np.testing.assert_allclose(found, value.value(states), rtol=1e-12)
+    for mixing in (interpolate_visible, interpolate_joined):
+        found = [mixing(value.flat, geometry, x) for x in states]
+        np.testing.assert_allclose(found, value.value(states), rtol=1e-12)
 
 
 def test_beside_an_obstacle_infinite_nodes_do_not_count() -> None:
