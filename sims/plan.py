@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ocp.files import atomic_path, write_text
-from ocp.grid import GridValue
 from ocp.planning import Plan, deadline, plan, trajectories
+from ocp.pontryagin import ExactValue
 from ocp.query import Query
 from ocp.query_file import query_to_dict
 from ocp.trajectory import SolveError, Trajectory
@@ -92,8 +92,12 @@ def solve(
     with notes.status("exact optimum") as status:
         for k, (start, loop) in enumerate(zip(starts, loops, strict=True), 1):
             status.update(f"exact optimum {k} of {len(starts)}")
-            exact, why_not = _exact(query, start) if with_exact else (None, None)
             value = float(np.asarray(answer.value.value(start)))
+            exact, why_not = None, None
+            if with_exact and np.isfinite(value):
+                exact, why_not = _exact(query, start)
+            elif with_exact:
+                why_not = f"{method} found no admissible motion, so none was looked for"
             outcomes.append(Outcome(value, loop, exact, why_not))
     return answer, outcomes
 
@@ -207,7 +211,7 @@ def write_outputs(
             answer.query,
             [o.rollout for o in outcomes],
             [o.exact for o in outcomes],
-            answer.value if isinstance(answer.value, GridValue) else None,
+            None if isinstance(answer.value, ExactValue) else answer.value,  # too slow to map
         )
         legend(figure)
         save(figure, folder / "plan.png")

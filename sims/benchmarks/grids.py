@@ -107,7 +107,7 @@ def _contenders() -> list[Contender]:
         set_valued("set-valued, value iteration", Method.JACOBI, Image.NEAREST, 1),
         set_valued("set-valued, label setting", Method.LABEL_SETTING, Image.NEAREST, 5),
         set_valued("set-valued, lateral alpha", Method.LABEL_SETTING, Image.LATERAL, 5),
-        *(eikonal(scheme, nodes) for scheme in Scheme for nodes in SIZES),
+        *(eikonal(scheme, nodes) for scheme in list(Scheme)[:2] for nodes in SIZES),
     ]
 
 
