@@ -115,7 +115,8 @@ def polytope_clearances(points, edges, distances, gradients, sides, facets, out)
 
     Args:
         points, edges: `[n, d]`, `[m, 2]`.
-        distances, gradients: `[n]`, `[n, d]`, signed distance of the points from the polytope.
+        distances, gradients: `[n]`, `[n, d]`, signed distance of the points from the polytope;
+            infinite for points too far to matter: clearances beyond theirs may be too large.
         sides: `[s, 2, d]`, its edges.
         facets: `[f, d + 1]`, rows (a, b) with a . x + b <= 0 inside.
         out: `[m]`, written; 0 for edges that pass through.
@@ -132,10 +133,10 @@ def polytope_clearances(points, edges, distances, gradients, sides, facets, out)
         for k in range(d):
             slope_a += gradients[i, k] * (b[k] - a[k])
             slope_b += gradients[j, k] * (b[k] - a[k])
-        if slope_a >= 0.0:
+        if slope_a >= 0.0 and distances[i] < np.inf:
             out[e] = distances[i]
             continue
-        if slope_b <= 0.0:
+        if slope_b <= 0.0 and distances[j] < np.inf:
             out[e] = distances[j]
             continue
         enters, leaves = 0.0, 1.0

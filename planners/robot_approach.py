@@ -7,7 +7,7 @@ from planners.roadmap import Roadmap
 from planners.roadmap_kernels import nodes_within
 
 # How many connection radii away the robot looks for a node, when nearer ones are barred.
-WIDEST = 4
+WIDEST = 2
 
 
 class Approach:

@@ -18,6 +18,7 @@ from planners.blockage import Blockage, find_blockage
 from planners.roadmap import Roadmap
 from planners.roadmap_kernels import nearest_first, net_changes
 from planners.robot_approach import Approach
+from planners.samples import Samples
 from planners.shortcut import shortest_over_corners
 from planners.tree import Tree
 from planners.world import World, checked_padding, checked_point
@@ -136,7 +137,7 @@ class RRTX:
         padding: float = 0.0,
         epsilon: float = 0.0,
         reach: float | None = None,
-        radius_factor: float = 0.75,
+        radius_factor: float = 0.9,
         horizon: float | None = None,
         culling: bool = False,
     ) -> None:
@@ -175,7 +176,7 @@ class RRTX:
             raise ValueError(f"horizon: must be finite and exceed the padding, got {horizon}")
         if not (np.isfinite(epsilon) and epsilon >= 0):
             raise ValueError(f"epsilon: must be a finite number of at least 0, got {epsilon}")
-        self._random = np.random.default_rng(seed)
+        self._samples = Samples(world.dimension, seed)
         self._roadmap = Roadmap(
             world,
             checked_point(world, goal, "goal"),
@@ -392,8 +393,8 @@ class RRTX:
         )
 
     def _grow(self, count: int, to_the_end: bool, begun: float) -> Update:
-        d = self.world.dimension
-        samples = self._random.uniform(self.world.lower, self.world.upper, (count, d))
+        lower, upper = self.world.lower, self.world.upper
+        samples = lower + self._samples.take(count) * (upper - lower)
         freed = self._roadmap.insert(samples)
         self._tree.grow()
         self._roadmap.compress(self._tree.parent)

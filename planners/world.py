@@ -262,8 +262,9 @@ class SceneWorld:
         index = edges_within(
             points, edges, lengths, solid.center, solid.rotation, lower, upper, within
         )
-        exact = self._exact(handle, points, edges[index])
-        return EdgeClearances(index, exact, exact.copy())
+        exact = self._exact(handle, points, edges[index], within)
+        near = exact <= within
+        return EdgeClearances(index[near], exact[near], exact[near])
 
     def refine(
         self,
@@ -274,7 +275,7 @@ class SceneWorld:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         k = len(starts)
         pairs = np.column_stack([np.arange(k), np.arange(k, 2 * k)])
-        exact = self._exact(handle, np.concatenate([starts, ends]), pairs)
+        exact = self._exact(handle, np.concatenate([starts, ends]), pairs, np.inf)
         return exact, exact.copy()
 
     def certify(
@@ -328,9 +329,16 @@ class SceneWorld:
         self._solids[handle] = solid
 
     def _exact(
-        self, handle: int, points: NDArray[np.float64], edges: NDArray[np.int64]
+        self,
+        handle: int,
+        points: NDArray[np.float64],
+        edges: NDArray[np.int64],
+        within: float,
     ) -> NDArray[np.float64]:
-        """Exact clearance `[m]` of edges `[m, 2]` from one obstacle; at most 0 if they touch it."""
+        """Clearance `[m]` of edges `[m, 2]` from one obstacle; at most 0 if they touch it.
+
+        Exact up to `within`: points whose box distance exceeds it are not asked about.
+        """
         solid = self._solids[handle]
         out = np.empty(len(edges))
         if solid.shape is Shape.BALL:
@@ -338,9 +346,15 @@ class SceneWorld:
             ball_clearances(a, b, solid.center, solid.radius, out)
             return out
         used, compact = np.unique(edges, return_inverse=True)
-        distance, gradient = self._from(handle, points[used])
+        corners = points[used]
+        local = (corners - solid.center) @ solid.rotation
+        lower, upper = solid.bounds
+        gaps = np.maximum(np.maximum(lower - local, local - upper), 0.0)
+        near = (gaps**2).sum(axis=1) <= within * within
+        distance, gradient = np.full(len(used), np.inf), np.zeros(corners.shape)
+        distance[near], gradient[near] = self._from(handle, corners[near])
         pairs = np.ascontiguousarray(compact.reshape(-1, 2))
-        polytope_clearances(points[used], pairs, distance, gradient, solid.sides, solid.facets, out)
+        polytope_clearances(corners, pairs, distance, gradient, solid.sides, solid.facets, out)
         return out
 
     def _from(
