@@ -4,6 +4,7 @@ An optimal cost counts as truth (`established`) only when two independent method
 `TRUTH_TOLERANCE` and no method, homotopy class or guess found a cheaper one.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.closed_form import straight_value
 from ocp.collocation import solve_collocation
+from ocp.extremal import find_extremal
 from ocp.pontryagin import exact_trajectory
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status, Trajectory
@@ -127,7 +129,7 @@ def consult(query: Query, state: ArrayLike) -> Verdict:
         answers["closed form"] = Answer(straight_value(query, start), None)
     except SolveError as error:
         answers["closed form"] = _failed(error)
-    answers["PMP"] = _answer(lambda: exact_trajectory(query, start))
+    answers["PMP"] = _answer(lambda: _extremal(query, start))
     answers["collocation"] = _answer(lambda: solve_collocation(query, start))
     guess = answers["PMP"].motion
     if guess is not None:
@@ -137,7 +139,18 @@ def consult(query: Query, state: ArrayLike) -> Verdict:
     return Verdict(start, answers)
 
 
-def _answer(solve) -> Answer:
+def _extremal(query: Query, start: NDArray[np.float64]) -> Trajectory:
+    """The cheapest motion found, if it is an extremal: some answers are collocation's own."""
+    motion = exact_trajectory(query, start)
+    if motion.duration == 0:
+        return motion
+    extremal = find_extremal(query, start, motion)
+    if extremal.trajectory is None:
+        raise SolveError(extremal.status, extremal.detail)
+    return extremal.trajectory
+
+
+def _answer(solve: Callable[[], Trajectory]) -> Answer:
     try:
         motion = solve()
     except SolveError as error:
