@@ -9,7 +9,8 @@ which is monotone and causal: V(x) depends on smaller values only, so nodes are 
 the order of their values, from a heap (Mirebeau 2014, "Anisotropic fast-marching on Cartesian grids
 using lattice basis reduction"; 2018, "Fast-marching methods for curvature penalized shortest
 paths"). When a node is accepted its value is computed anew with differences of second order,
-(3 V(x) - 4 V(x + e) + V(x + 2 e)) / 2, along offsets whose both nodes are accepted, in order.
+(3 V(x) - 4 V(x + e) + V(x + 2 e)) / 2, along offsets whose both nodes are accepted, in order
+(limited, see `march_kernels`).
 
 Most of the error on a coarse grid is made near the goal, where V is not smooth. Where an exact
 value U without obstacles is known (`goal_table`; it solves the equation for some W_U <= W), the
@@ -41,7 +42,7 @@ __all__ = ["Marched", "march", "marched", "relaxation"]
 
 Floats = NDArray[np.float64]
 
-ARRIVAL_CELLS = 2.0  # nodes this near to the goal start with the cost of driving straight in
+ARRIVAL_CELLS = 3.0  # nodes this near to the goal start with the cost of driving straight in
 
 
 @dataclass(frozen=True)

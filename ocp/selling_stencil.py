@@ -1,7 +1,7 @@
 """The offsets and weights of fast marching on a grid, for any driftless robot of 1 to 3 states.
 
 V solves p' D p = 4 W with p = grad V and D = G R^-1 G'. Where D is singular (a robot that cannot
-move sideways) it is relaxed: seen in coordinates scaled by the largest speed along each, D's
+move sideways) it is relaxed: seen in coordinates scaled by the mean square speed along each, D's
 eigenvalues are raised to at least relaxation^2 times the largest. For the unicycle that is
 n n' + relaxation^2 t t' in the plane, n along the heading and t across it (Mirebeau 2018, "Fast-
 marching methods for curvature penalized shortest paths", the Reeds-Shepp model). In units of cells,
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ocp.batch import rates
 from ocp.cost import RunningCost
 from ocp.grid import Grid
 from ocp.query import Goal, Query
@@ -83,14 +83,16 @@ def relaxed_metrics(query: Query, states: Floats, relaxation: float) -> Floats:
     Raises:
         SolveError: NOT_APPLICABLE if no input moves some coordinate.
     """
-    m = query.system.m
-    columns = [rates(query, states, np.tile(unit, (len(states), 1))) for unit in np.eye(m)]
-    G = np.stack(columns, axis=-1) / np.sqrt(query.input_weights)
+    system, count = query.system, len(states)
+    column = ca.vec(ca.densify(system.input_matrix))  # pyright: ignore[reportArgumentType]
+    matrices = ca.Function("G", [system.state], [column]).map(count)
+    G = np.array(matrices(states.T)).T.reshape(count, system.m, system.n).swapaxes(1, 2)
+    G = G / np.sqrt(query.input_weights)
     D = G @ np.swapaxes(G, -1, -2)
-    speeds = np.sqrt(np.einsum("kii->ki", D).max(axis=0))
+    speeds = np.sqrt(np.einsum("kii->ki", D).mean(axis=0))
     if not (speeds > 0).all():
-        stuck = query.system.coordinates[int(speeds.argmin())].name
-        raise SolveError(Status.NOT_APPLICABLE, f"no input of {query.system.name} moves {stuck}")
+        stuck = system.coordinates[int(speeds.argmin())].name
+        raise SolveError(Status.NOT_APPLICABLE, f"no input of {system.name} moves {stuck}")
     scale = np.multiply.outer(speeds, speeds)
     sizes, directions = np.linalg.eigh(D / scale)
     sizes = np.maximum(sizes, relaxation**2 * sizes[:, -1:])

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from references import TABLE_ONE_OPTIMA, aligned_value
 
 from ocp import march_kernels
+from ocp.batch import state_costs
 from ocp.cost import RunningCost
-from ocp.fast_marching import march, marched, relaxation
+from ocp.fast_marching import _Problem, march, marched, relaxation
 from ocp.goal_table import goal_table
 from ocp.grid import Grid, GridValue
 from ocp.models import MODELS
@@ -59,54 +60,79 @@ SQUEEZED = np.array([[1.0, 0.3, 0.0], [0.2, 0.35, 0.1], [0.0, 0.2, 0.6]])
 """Offsets of its metric reach several cells."""
 
 
+def exact_distance(points: np.ndarray, matrix: np.ndarray, radius: float) -> np.ndarray:
+    """Distance `[k]` of `points` `[k, d]` from a ball about 0 in the metric M = (B B')^-1.
+
+    The nearest point y of the sphere satisfies (M + m I) y = M x; m by bisection.
+    """
+    sizes, axes = np.linalg.eigh(np.linalg.inv(matrix @ matrix.T))
+    z = points @ axes
+    low, high, y = np.zeros(len(z)), np.full(len(z), 1e3 * sizes.max()), z
+    for _ in range(60):
+        m = (low + high) / 2
+        y = sizes * z / (sizes + m[:, None])
+        outside = np.linalg.norm(y, axis=1) > radius
+        low, high = np.where(outside, m, low), np.where(outside, high, m)
+    return np.sqrt((sizes * (z - y) ** 2).sum(axis=1))
+
+
 def distance_error(matrix, cells: int, order: int) -> float:
-    """Mean error of V at 0.5 m or more from the goal, away from the boundary of the box."""
+    """Mean error of V, with W = 1 and exact values given within 0.7 m of a ball of 1 m.
+
+    The box is not a constraint on paths: they may bend out of it, so its border is left out.
+    """
     B = np.asarray(matrix, dtype=float)
     d = len(B)
-    center, radius = np.array([0.3, -0.2, 0.1])[:d], 2.0
-    query = Query(steered(B), Goal(tuple(center), radius), cost=UNIT)
+    query = Query(steered(B), Goal((0.0,) * d, 1.0))
     grid = Grid.of(query.system, (cells + 1,) * d)
-    values = march(query, grid, order=order)
-    nodes = grid.nodes()
-    tested = (query.goal_distance(nodes) > 0.5) & (abs(nodes) < 4.0).all(axis=-1)
-    # The nearest point of the goal in the metric D^-1, among many on its surface.
-    count = 40_000 if d == 3 else 4_000
-    k = np.arange(count) + 0.5
-    turn = math.pi * (1 + math.sqrt(5)) * k
-    if d == 1:
-        surface = np.array([[-1.0], [1.0]])
-    elif d == 2:
-        surface = np.column_stack([np.cos(2 * np.pi * k / count), np.sin(2 * np.pi * k / count)])
-    else:
-        z = 1 - 2 * k / count
-        ring = np.sqrt(1 - z**2)
-        surface = np.column_stack([np.cos(turn) * ring, np.sin(turn) * ring, z])
-    from scipy.spatial import cKDTree
-
-    flat = np.linalg.inv(np.linalg.cholesky(B @ B.T))
-    tree = cKDTree((center + radius * surface) @ flat.T)
-    exact = 2 * tree.query(nodes[tested] @ flat.T)[0]
-    return float(abs(values[tested] - exact).mean())
+    nodes = grid.nodes().reshape(-1, d)
+    distance = query.goal_distance(nodes)
+    exact = np.where(distance <= 0, 0.0, 2 * exact_distance(nodes, B, 1.0))
+    problem = _Problem(query, grid, relaxation(grid))
+    given = np.where(distance < 0.7, exact, np.inf).reshape(grid.shape)
+    values = problem.stencil.padded(given, np.inf)
+    right = np.full(len(values), 4.0)
+    values, _ = problem.solve(values, right, right, np.zeros((0, 2)), order)
+    values = problem.stencil.unpadded(values).ravel()
+    tested = (distance > 0.7) & (abs(nodes) < 3.5).all(axis=1)
+    return float(abs(values - exact)[tested].mean())
 
 
 @pytest.mark.parametrize(
     ("matrix", "cells", "order", "band"),
     [
-        ([[1.5]], (20, 40, 80), 1, (0.8, 1.2)),
-        (np.eye(2), (20, 40, 80, 160), 1, (0.7, 1.1)),
-        (np.eye(2), (20, 40, 80, 160), 2, (1.5, 2.3)),
-        (np.eye(3), (16, 32, 64), 1, (0.6, 1.1)),
-        (np.eye(3), (16, 32, 64), 2, (1.4, 2.4)),
-        (SQUEEZED[:2, :2], (20, 40, 80, 160), 1, (0.6, 1.1)),
-        (SQUEEZED[:2, :2], (20, 40, 80, 160), 2, (1.3, 2.4)),
-        (SQUEEZED, (24, 48, 96), 2, (1.2, 2.4)),
+        (np.eye(2), (40, 80, 160), 1, (0.8, 1.1)),
+        (np.eye(2), (40, 80, 160), 2, (1.7, 2.4)),
+        (np.eye(3), (24, 48), 1, (0.8, 1.3)),
+        (np.eye(3), (24, 48), 2, (1.6, 2.4)),
+        (SQUEEZED[:2, :2], (40, 80, 160), 1, (0.8, 1.1)),
+        (SQUEEZED[:2, :2], (40, 80, 160), 2, (1.7, 2.4)),
+        (SQUEEZED, (28, 56), 1, (0.6, 1.1)),
+        (SQUEEZED, (28, 56), 2, (1.5, 2.4)),
     ],
-    ids=["1d", "2d", "2d-second", "3d", "3d-second", "squeezed", "squeezed-second", "squeezed-3d"],
+    ids=["2d", "2d-2", "3d", "3d-2", "squeezed", "squeezed-2", "squeezed-3d", "squeezed-3d-2"],
 )
 def test_order_of_convergence_to_the_exact_distance(matrix, cells, order, band):
     errors = [distance_error(matrix, c, order) for c in cells]
-    mean = math.log(errors[0] / errors[-1]) / math.log(cells[-1] / cells[0])
-    assert band[0] < mean < band[1], (errors, order_of(errors, 1 / np.array(cells)))
+    orders = order_of(errors, 1 / np.array(cells))
+    assert ((band[0] < orders) & (orders < band[1])).all(), (errors, orders)
+
+
+def test_in_one_dimension_steady_cost_gives_the_distance_exactly():
+    assert distance_error([[1.5]], 20, 1) < 1e-12
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_from_the_goal_ball_alone_the_nodes_next_to_it_drive_straight_in(d):
+    """The default start, and the costs of the query: V = 2 (|x - c| - r)."""
+    query = Query(f"single-integrator-{d}d", Goal((0.3, -0.2, 0.1)[:d], 1.0), cost=UNIT)
+    grid = Grid.of(query.system, (41,) * d)
+    nodes = grid.nodes()
+    exact = np.maximum(0.0, 2 * query.goal_distance(nodes))
+    error = abs(march(query, grid) - exact)
+    plain = abs(march(query, grid, seed=False) - exact)
+    assert error.max() < 0.15  # of up to 14
+    assert error.mean() < 0.01 + 0.3 * plain.mean()
 
 
 def test_round_a_wall_it_is_the_length_of_the_shortest_path():
@@ -122,28 +148,30 @@ def test_round_a_wall_it_is_the_length_of_the_shortest_path():
         tip = np.array([0.0, 2.0])
         exact = 2 * np.linalg.norm(nodes - tip, axis=-1) + 2 * (np.hypot(3.0, 4.0) - 1.0)
         errors.append(float((march(query, grid)[hidden] / exact[hidden] - 1).mean()))
-    # The corner is a point source for second-order differences: first order.
-    assert 0 < errors[2] < 0.01
-    assert (order_of(errors, [1 / 40, 1 / 80, 1 / 160]) > 0.6).all()
+    # The corner is a point source, with an error of first order whatever the differences.
+    assert 0 < errors[2] < 0.03
+    assert ((order_of(errors, [4, 2, 1]) > 0.7) & (order_of(errors, [4, 2, 1]) < 1.3)).all()
 
 
 # The unicycle
 
 
 @cache
-def optimum_error(goal, cells: int) -> float:
+def optimum_error(goal, cells: int, headings: int) -> float:
+    """Relative error at START, which is a node."""
     obstacles = {(1.0, 1.0): THREE[:1], (4.0, 4.0): ()}.get(goal, THREE)
     query = Query("unicycle", Goal(goal, 0.5), obstacles)
-    grid = half(query, cells + 1, cells + 1, round(0.315 * cells))
+    grid = half(query, cells + 1, cells + 1, headings)
     return float(GridValue(grid, march(query, grid)).value(START)) / TABLE_ONE_OPTIMA[goal] - 1
 
 
 @pytest.mark.parametrize("goal", TABLE_ONE_OPTIMA)
 def test_the_optimal_costs_of_the_paper_s_queries(goal):
-    """Errors are mostly of the interpolation at START, and of the relaxation."""
-    coarse, fine = optimum_error(goal, 28), optimum_error(goal, 112)
-    assert abs(coarse) < 0.012
-    assert abs(fine) < 0.0025
+    """START is where two ways round are equally good in [1, 1]: the largest error of the four."""
+    coarse, fine = optimum_error(goal, 30, 8), optimum_error(goal, 110, 36)
+    assert abs(coarse) < 0.02
+    assert abs(fine) < 0.004
+    assert abs(fine) < 0.5 * abs(coarse) + 1e-5
 
 
 def test_without_obstacles_the_table_is_met_whatever_the_grid():
@@ -156,13 +184,13 @@ def test_without_obstacles_the_table_is_met_whatever_the_grid():
             assert np.allclose(march(query, grid, order=order), exact, rtol=1e-9, atol=1e-9)
 
 
-def unseeded_errors(cells: int, order: int = 2) -> np.ndarray:
+def unseeded_errors(cells: int, relaxation: float | None = None) -> np.ndarray:
     """Relative errors at random states without use of the table, against the table."""
     query = Query("unicycle", Goal((1.0, 0.5), 0.8))
     grid = half(query, cells + 1, cells + 1, round(0.315 * cells))
     states = np.random.default_rng(5).uniform([-5, -5, -np.pi], [5, 5, np.pi], (1500, 3))
     states = states[query.goal_distance(states) > 1.0]
-    value = GridValue(grid, march(query, grid, order=order, seed=False)).value(states)
+    value = GridValue(grid, march(query, grid, relaxation=relaxation, seed=False)).value(states)
     return value / goal_table(query, 14.0).value(states) - 1
 
 
@@ -170,9 +198,15 @@ def test_with_the_relaxation_tied_to_the_grid_it_converges_off_axis():
     """At random states and headings, from the goal ball alone: an aligned test cannot see this."""
     cells = (30, 60, 120)
     errors = [float(np.median(abs(unseeded_errors(c)))) for c in cells]
-    assert errors[-1] < 0.01
+    assert errors[-1] < 0.02
     mean = math.log(errors[0] / errors[-1]) / math.log(4)
-    assert 0.8 < mean < 1.7, errors
+    assert 1.0 < mean < 1.6, errors
+
+
+def test_a_fixed_relaxation_does_not_converge():
+    """It lets the robot slip sideways: V stays too low, however fine the grid."""
+    errors = [float(np.median(unseeded_errors(c, relaxation=0.7))) for c in (60, 120)]
+    assert errors[1] < min(errors[0], -0.02), errors
 
 
 def test_facing_the_goal_it_converges_to_the_closed_form():
@@ -185,8 +219,9 @@ def test_facing_the_goal_it_converges_to_the_closed_form():
         grid = half(query, count, count, headings)
         value = GridValue(grid, march(query, grid, seed=False)).value(states)
         errors.append(float(abs(value / exact - 1).mean()))
-    assert errors[-1] < 0.004
-    assert (order_of(errors, [1, 1 / 2, 1 / 4]) > 0.8).all()
+    assert errors[-1] < 0.01
+    orders = order_of(errors, [4, 2, 1])
+    assert ((orders > 1.0) & (orders < 1.9)).all()
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -197,14 +232,13 @@ def test_half_a_turn_of_headings_gives_the_same_as_the_whole(order, seed):
     part = march(query, half(query, 31, 29, 9), **settings)
     whole = march(query, Grid.of(query.system, (31, 29, 18)), **settings)
     assert np.allclose(whole[..., :9], part, rtol=1e-9)
-    # Ties broken otherwise may change a value of second order, where V has a kink.
-    assert np.isclose(whole[..., 9:], part, rtol=1e-9).mean() > 0.99
-    assert np.allclose(whole[..., 9:], part, rtol=1e-3)
+    assert np.allclose(whole[..., 9:], part, rtol=1e-9)
 
 
-def test_an_unknown_robot_needs_no_formula_of_its_own():
-    """The unicycle written with its heading in other units: same V at the same places."""
+def test_a_robot_in_other_units_has_the_same_stencil():
+    """The unicycle with its heading in degrees: nothing is known of robots but their G and R."""
     state = ca.SX.sym("x", 3)
+    degree = math.pi / 180
     degrees = System(
         "degrees",
         (
@@ -216,20 +250,21 @@ def test_an_unknown_robot_needs_no_formula_of_its_own():
         state,
         ca.SX.zeros(3, 1),
         ca.vertcat(
-            ca.horzcat(ca.cos(state[2] * math.pi / 180), 0),
-            ca.horzcat(ca.sin(state[2] * math.pi / 180), 0),
+            ca.horzcat(ca.cos(state[2] * degree), 0),
+            ca.horzcat(ca.sin(state[2] * degree), 0),
             ca.horzcat(0, 1),
         ),
         (0, 1),
         half_turn=2,
     )
-    known = Query("unicycle", Goal((1.0, 3.0), 0.5), THREE)
-    query = Query(degrees, known.goal, THREE, RunningCost(input=(1.0, (math.pi / 180) ** 2)))
-    assert np.allclose(
-        march(query, half(query, 25, 25, 8), seed=False),
-        march(known, half(known, 25, 25, 8), seed=False),
-        rtol=1e-9,
-    )
+    goal = Goal((1.0, 3.0), 0.5)
+    known = Query("unicycle", goal)
+    other = Query(degrees, goal, cost=RunningCost(input=(1.0, degree**2)))
+    mine = selling_stencil(other, half(other, 25, 25, 8), 0.2)
+    expected = selling_stencil(known, half(known, 25, 25, 8), 0.2)
+    for field in ("offsets", "near", "far", "reverse", "entry"):
+        assert np.array_equal(getattr(mine, field), getattr(expected, field))
+    assert np.allclose(mine.weights, expected.weights, rtol=1e-9)
 
 
 # Laws of the scheme
@@ -274,8 +309,6 @@ def test_first_order_values_solve_the_scheme_at_every_node(name):
     march_kernels.schemes(
         s.padded(result.values, np.inf), s.entry, s.count, s.weights, s.near, s.far, False, left, _
     )
-    from ocp.batch import state_costs
-
     right = 4 * state_costs(query, grid.nodes())
     residual = s.unpadded(left).ravel() - right.ravel()
     assert abs(residual[result.accepted]).max() < 1e-8 * right.max()
@@ -317,7 +350,7 @@ def test_with_a_free_robot_the_relaxation_does_not_matter():
 
 
 def test_the_unicycle_s_metric_is_relaxed_across_its_heading_only():
-    headings = np.linspace(-3.0, 3.0, 7)
+    headings = np.linspace(-np.pi, np.pi, 7, endpoint=False)
     states = np.column_stack([0 * headings, 0 * headings, headings])
     query = Query("unicycle", Goal((0.0, 0.0), 0.5), cost=RunningCost(input=(0.25, 4.0)))
     n = np.stack([np.cos(headings), np.sin(headings)], axis=-1)
@@ -373,7 +406,7 @@ def test_a_gap_lets_the_robot_through_unless_it_is_too_big(name):
     through = march(query, grid)
     left = grid.nodes()[..., 0] < -0.5
     assert np.isfinite(through[left]).all()
-    assert (through[left] >= open_world[left] * 0.999).all()
+    assert (through[left] >= open_world[left] * 0.99).all()
     assert np.median(through[left] / open_world[left]) > 1.05
     stout = march(replace(query, robot_radius=0.75), grid)
     assert np.isinf(stout[left]).all()
