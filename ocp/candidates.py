@@ -35,7 +35,7 @@ FIRST_MOVES = 8
 FIRST_LENGTH = 1.2  # of a first move, in the R-norm of the input
 FIRST_STEPS = 12
 ALIKE = 0.02  # of the domain: guesses that stay as close together are one
-FAN = np.array([-1.6, -1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0, 1.6])  # see `_grown`
+FAN = np.linspace(-2.0, 2.0, 13)  # see `_grown`
 FAN_KEPT = 3
 CLOSE = 0.5  # in units of that scale
 HORIZONS = np.array([0.5, 1.0, 2.0, 4.0])  # seconds a metre to the goal; see `_fixed_time`
@@ -96,7 +96,7 @@ def candidate_guesses(
     elif query.system.has_drift:
         motions = _fixed_time(query, start)
     bound = min((g.cost for g in motions if len(g.times) >= FEWEST_STEPS), default=np.inf)
-    if distance < GROWN:
+    if distance < GROWN and query.system.n <= MAX_DIMENSION:
         motions = _grown(query, start) + motions
     motions += default_guesses(query, start, limit=6)
     least, alike = motions[0].cost, ALIKE * min(1.0, distance)
@@ -118,16 +118,22 @@ def candidate_guesses(
 def _grown(query: Query, start: Array) -> list[Trajectory]:
     """The extremals, of a fan grown from the goal's boundary, that pass nearest to `start`.
 
-    Near the goal positions move by about the distance d to it, other coordinates by its root.
+    Near the goal, at the distance d, motions change coordinates other than distance by about the
+    root of d: at a graze that takes the longest, cost is saved by sliding along the boundary.
     """
     system = query.system
     place = list(system.position)
-    d = float(query.goal_distance(start))
+    d, size = float(query.goal_distance(start)), len(system.position)
+    outward = query.position(start) - np.array(query.goal.center)
+    _, _, basis = np.linalg.svd(outward[None])
+    across = np.zeros((system.n - 1, system.n))  # all directions but the goal's
+    across[: size - 1, place] = basis[1:]
+    across[size - 1 :, [i for i in range(system.n) if i not in place]] = np.eye(system.n - size)
+    steps = np.array(list(product(*([FAN * np.sqrt(d)] * (system.n - 1)))))
+    reach = np.sqrt(float(state_costs(query, start)) + 1e-12) * (d + np.sqrt(d))
+    fan = backward_characteristics(query, start + steps @ across, 6 * reach, tolerance=1e-7)
     scale = np.full(system.n, np.sqrt(d))
     scale[place] = d
-    offsets = np.array(list(product(*([FAN] * system.n)))) * scale
-    reach = np.sqrt(float(state_costs(query, start)) + 1e-12) * (d + np.sqrt(d))
-    fan = backward_characteristics(query, start + offsets, 6 * reach, tolerance=1e-6)
     gaps = np.abs((fan.states - start) / scale).max(axis=-1)
     nearest, point = np.nanmin(gaps, axis=1), np.nanargmin(gaps, axis=1)
     cost = np.where(nearest < CLOSE, fan.costs[np.arange(len(point)), point], np.inf)
@@ -157,19 +163,25 @@ def _retimed(query: Query, guess: Trajectory) -> Trajectory:
 
 
 def _fixed_time(query: Query, start: Array) -> list[Trajectory]:
-    """Extremals of fixed durations whose end is pulled to the goal's centre, where they hit it."""
+    """Motions of fixed durations whose end is pulled to the goal's centre, up to the goal.
+
+    First with neither obstacles nor goal cost (for linear robots one Newton step), then with all.
+    """
     place = list(query.system.position)
     pull = np.zeros((query.system.n, query.system.n))
     pull[place, place] = PULL
     condition = quadratic_condition(query.reference, pull)
+    bare = replace(unbounded(query), obstacles=(), cost=replace(query.cost, goal=0.0))
     motions = []
     for horizon in HORIZONS * max(1.0, float(query.goal_distance(start))):
         rough = default_guesses(query, start, float(horizon), limit=1)[0]
-        extremal = find_extremal(query, start, rough, condition, segments=FINE_SEGMENTS)
-        if extremal.trajectory is not None:
-            motion = until_goal(query, extremal.trajectory)
-            if query.goal_distance(motion.states[-1]) < 1e-6:
-                motions.append(motion)
+        first = find_extremal(bare, start, rough, condition, segments=FINE_SEGMENTS).trajectory
+        if first is None:
+            continue
+        full = find_extremal(query, start, first, condition, segments=FINE_SEGMENTS).trajectory
+        ends = [until_goal(query, m) for m in (full, replace(first, costates=None)) if m]
+        slack = 1e-2 * query.goal.radius
+        motions += [m for m in ends if query.goal_distance(m.states[-1]) < slack][:1]
     return sorted(motions, key=lambda g: g.cost)
 
 

@@ -76,6 +76,7 @@ def find_extremal(
     *,
     segments: int = SEGMENTS,
     tolerance: float = NEWTON_TOLERANCE,
+    step_tolerance: float = STEP_TOLERANCE,
     max_iterations: int = 40,
 ) -> Extremal:
     """The extremal near `guess`; never raises for want of convergence.
@@ -87,6 +88,7 @@ def find_extremal(
         condition: the end's; by default the goal's.
         segments: of multiple shooting.
         tolerance: of the last Newton correction, relative to 1 + size.
+        step_tolerance: of the integration, likewise.
         max_iterations: of Newton's method.
     """
     condition = condition or goal_condition(query)
@@ -94,13 +96,14 @@ def find_extremal(
     if condition.at_goal:
         guess = until_goal(query, guess)
     guess = with_costates(query, guess)
-    shot = _shoot(query, condition, start, guess, segments, tolerance, max_iterations)
+    settings = np.array([tolerance, step_tolerance, max_iterations, LEAST_DAMPING])
+    shot = _shoot(query, condition, start, guess, segments, settings)
     iterations, seconds = shot.iterations, shot.seconds
     for _ in range(REFINEMENTS):
         if shot.motion is None or not shot.detail:
             break
         segments *= 2
-        shot = _shoot(query, condition, start, shot.motion, segments, tolerance, max_iterations)
+        shot = _shoot(query, condition, start, shot.motion, segments, settings)
         iterations, seconds = iterations + shot.iterations, seconds + shot.seconds
     if shot.motion is None or shot.detail:
         return Extremal(Status.NOT_CONVERGED, shot.detail, iterations, seconds)
@@ -116,7 +119,7 @@ def find_extremal(
 
 @dataclass(frozen=True)
 class _Shot:
-    """A Newton solve: `motion` if it converged; `detail` says what is wrong with it, if anything."""
+    """A Newton solve: `motion` if it converged; `detail` says what is wrong, if anything is."""
 
     iterations: int
     seconds: float
@@ -131,8 +134,7 @@ def _shoot(
     start: Array,
     guess: Trajectory,
     segments: int,
-    tolerance: float,
-    max_iterations: int,
+    settings: Array,
 ) -> _Shot:
     n = query.system.n
     fractions, nodes = _nodes(guess, segments)
@@ -141,7 +143,7 @@ def _shoot(
     functions, q, layout = shooting_addresses(query), parameters(query), flow_layout(query)
     # Near the goal costates and costs are small themselves.
     small = float(np.clip(guess.cost, 1e-5, 1.0)) if condition.at_goal else 1.0
-    settings = np.array([small * tolerance, small * STEP_TOLERANCE, max_iterations, LEAST_DAMPING])
+    settings = settings * [small, small, 1.0, 1.0]
     begun = time.perf_counter()
     ended, iterations, duration, _ = shoot(
         condition.kind, condition.at_goal, functions, q, layout, condition.terms, settings,

@@ -134,7 +134,11 @@ def _search(query: Query, start: Array, guess: Value | Policy | None) -> list[Tr
         if found:
             break
     touching = any(e.status is Status.NOT_APPLICABLE for e in extremals)
-    if not found or touching or found[0].cost > SUSPICIOUS * candidates.bound:
+    missed = bool(found) and found[0].cost > SUSPICIOUS * candidates.bound
+    # Without a value to tell which class is best, two guesses must agree.
+    agreed = sum(e.cost <= (1 + DUPLICATE) * found[0].cost for e in extremals if found)
+    lonely = query.system.has_drift and guess is None and agreed < 2
+    if not found or touching or missed or lonely:
         found = _distinct(found + _by_collocation(query, start, candidates.guesses))
     if not found:
         raise SolveError(extremals[0].status, extremals[0].detail)
