@@ -32,7 +32,9 @@ BELLMAN = types.FunctionType(
         ADDRESSES, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX,
     )
 )  # fmt: skip
-SCRATCH_ROWS = 6
+SCRATCH_ROWS = 7
+SLACK = 0.3
+NEAR = 2.0
 OVERSHOOT = 1.2  # a step that speeds up is shortened until it exceeds its cells by no more
 MAX_SHORTENINGS = 6
 ARRIVAL_DIRECTIONS = 64
@@ -50,7 +52,7 @@ GAUSS = (0.21132486540518713, 0.7886751345948129)
 
 
 def bellman_addresses(query: Query, for_scheme: bool = False) -> NDArray[np.intp]:
-    """The functions that `bellman` calls, and itself last, for this query.
+    """The functions that `bellman` calls, itself, and `feedback`, for this query.
 
     Beside hard obstacles a scheme, whose values feed on each other, mixes values by
     `interpolate_joined`, and a policy by `interpolate_visible`.
@@ -58,7 +60,9 @@ def bellman_addresses(query: Query, for_scheme: bool = False) -> NDArray[np.intp
     k = kernels(query)
     beside = interpolate_joined if for_scheme else interpolate_visible
     mixing = beside if query.hard_obstacles else interpolate
-    return addresses([k.dynamics, k.state_cost, mixing, clear_segment, bellman])
+    return addresses(
+        [k.dynamics, k.state_cost, mixing, clear_segment, bellman, k.optimal_input, feedback]
+    )
 
 
 def bellman_settings(
@@ -299,6 +303,69 @@ def bellman(x, u, candidates, spread, rounds, functions, q, settings, values, ge
 
 
 @compiled(
+    float64(
+        VECTOR, VECTOR, MATRIX, VECTOR, types.int64,
+        ADDRESSES, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX,
+    )
+)  # fmt: skip
+def feedback(x, u, candidates, spread, rounds, functions, q, settings, values, geometry, scratch):
+    """The input of a policy at `x` `[n]`, in `u` `[m]`; returns its `step_cost`.
+
+    The gradient of V by differences over a cell to both sides of `x` is of second order and gives
+    the best input, but not where two motions are equally good (it averages theirs), nor next to
+    infinite values. So its input is taken if a step under it loses no more than `SLACK` of its
+    cost against V(x), as the Bellman equation demands, and `bellman`'s otherwise.
+    """
+    n, m = x.shape[0], u.shape[0]
+    mixed_value = interpolation_at(functions[2, 0], functions[2, 1])
+    optimal_input = kernel_at(functions[5, 0], functions[5, 1])
+    here = mixed_value(values, geometry, x)
+    distance, cell = 0.0, 0.0
+    for i in range(settings.shape[0] - 4):
+        distance += (x[i] - settings[4 + i]) ** 2
+        cell = max(cell, settings[0] / geometry[n + i])
+    known = here < np.inf and math.sqrt(distance) - settings[3] > NEAR * cell
+    z, point = scratch[6], scratch[3, :n]
+    for i in range(n):
+        z[i] = point[i] = x[i]
+    for i in range(n):
+        h = 1.0 / geometry[n + i]
+        point[i] = x[i] + h
+        above = mixed_value(values, geometry, point)
+        point[i] = x[i] - h
+        below = mixed_value(values, geometry, point)
+        point[i] = x[i]
+        if above < np.inf and below < np.inf:
+            z[n + i] = (above - below) / (2.0 * h)
+        elif above < np.inf:
+            z[n + i] = (above - here) / h
+        elif below < np.inf:
+            z[n + i] = (here - below) / h
+        else:
+            known = False
+    if known:
+        optimal_input(z[: 2 * n], q, u)
+        if settings[2] > 0.0:
+            size = 0.0
+            for i in range(m):
+                size += q[i] * u[i] ** 2
+            known = size > 0.0
+            for i in range(m):
+                u[i] /= math.sqrt(size)
+    if known:
+        w = scalar_at(functions[1, 0], functions[1, 1])(x, q)
+        cost = step_cost(x, u, w, functions, q, settings, values, geometry, scratch)
+        if cost < np.inf:
+            step = cost - mixed_value(values, geometry, scratch[2, :n])
+            if cost - here <= SLACK * step:
+                return cost
+    u[:] = np.nan
+    return bellman(
+        x, u, candidates, spread, rounds, functions, q, settings, values, geometry, scratch
+    )
+
+
+@compiled(
     types.void(
         MATRIX, MATRIX, VECTOR, types.int64, ADDRESSES, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR
     )
@@ -307,7 +374,7 @@ def _bellman_rows(
     states, candidates, spread, rounds, functions, q, settings, values, geometry, out
 ):
     n, m = states.shape[1], candidates.shape[1]
-    scratch = np.empty((SCRATCH_ROWS, max(n, m)))
+    scratch = np.empty((SCRATCH_ROWS, max(2 * n, m)))
     u = np.empty(m)
     for row in range(states.shape[0]):
         u[:] = np.nan

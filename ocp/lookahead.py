@@ -93,8 +93,8 @@ def _lookahead(
 ):
     n, m, d = states.shape[1], inputs.shape[1], settings.shape[0] - 4
     state_cost = scalar_at(functions[1, 0], functions[1, 1])
-    bellman = bellman_at(functions[4, 0], functions[4, 1])
-    scratch = np.empty((SCRATCH_ROWS, max(n, m)))
+    feedback = bellman_at(functions[6, 0], functions[6, 1])
+    scratch = np.empty((SCRATCH_ROWS, max(2 * n, m)))
     for row in range(states.shape[0]):
         x, u = states[row], inputs[row]
         squared = 0.0
@@ -104,6 +104,8 @@ def _lookahead(
         if squared <= settings[3] ** 2:
             u[:] = 0.0
             continue
-        bellman(x, u, candidates, spread, rounds, functions, q, settings, values, geometry, scratch)
+        feedback(
+            x, u, candidates, spread, rounds, functions, q, settings, values, geometry, scratch
+        )
         if settings[2] > 0.0:
             u *= np.sqrt(state_cost(x, q))

@@ -126,7 +126,7 @@ def _iterate(
     count, n = nodes.shape
     m = inputs.shape[1]
     bellman = bellman_at(functions[4, 0], functions[4, 1])
-    scratch = np.empty((SCRATCH_ROWS, max(n, m)))
+    scratch = np.empty((SCRATCH_ROWS, max(2 * n, m)))
     nothing = np.empty((0, m))
     u = np.empty(m)
     index = np.zeros(n, dtype=np.int64)
