@@ -19,7 +19,9 @@ from planners.solids import Shape, Solid
 # Distances of the engine are good to 1e-12 at these sizes; whatever is closer than this to the
 # padding counts as blocked.
 TOLERANCE = 1e-9
-NOWHERE = np.zeros(0)
+# Certificates look this far ahead, as a part of the box: farther, the answers cost more than they
+# are worth.
+LOOK_AHEAD = 0.05
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,7 @@ class SceneWorld:
         self._graph = SceneGraph()
         self._source = self._graph.RegisterSource("obstacles")
         self._scene = _Lens(self._graph, self._source)
+        self._look_ahead = LOOK_AHEAD * float((self.upper - self.lower).max())
         self._solids: dict[int, Solid] = {}
         self._lenses: dict[int, _Lens] = {}
         self._ids: dict[int, Any] = {}
@@ -283,9 +286,9 @@ class SceneWorld:
     ) -> NDArray[np.bool_]:
         """Which straight segments `[k, d]` to `[k, d]` keep more than `padding` from everything.
 
-        Conservative advancement: at a point of the segment, no obstacle within the rest of its
-        length settles it; else the half-planes of the gradients say how far the segment is
-        free for certain, and the next question is asked there.
+        Conservative advancement: from a point of the segment, the free ball round it (looking no
+        farther than is worth the answers) and the half-planes of the gradients say how far
+        the segment is free for certain, and the next question is asked there.
         """
         first, last = _in_space(starts), _in_space(ends)
         query = self._scene.query.ComputeSignedDistanceToPoint
@@ -296,8 +299,9 @@ class SceneWorld:
             length = float(np.sqrt(direction @ direction))
             t = 0.0
             while True:
-                answers = query(a + t * direction, (1.0 - t) * length + level)
-                step = np.inf
+                ahead = min((1.0 - t) * length, self._look_ahead)
+                answers = query(a + t * direction, ahead + level)
+                step = np.inf if ahead < self._look_ahead else ahead / length
                 for answer in answers:
                     margin = answer.distance - level
                     slope = float(answer.grad_W @ direction)

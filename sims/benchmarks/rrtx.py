@@ -286,7 +286,7 @@ def _plot(figures: dict[str, Any], out: Path) -> None:
     left.set_yticks(range(1, len(names) + 1), names)
     left.set_xscale("log")
     left.set_xlabel("milliseconds; boxes: repair after a change, whiskers 5 and 95 %")
-    left.legend(loc="lower right", fontsize=8)
+    left.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize=8, frameon=False)
     left.grid(axis="x", alpha=0.3)
     plane = [n for n in names if any("excess" in r for r in figures["maps"][n]["events"])]
     for y, name in enumerate(plane, 1):
