@@ -1,9 +1,10 @@
 """Integration of the Hamiltonian flow x' = dH/dp, p' = -dH/dx both ways in time, with tangents.
 
-Dormand and Prince's pair of orders 5 and 4 (1980), with local extrapolation. A polygon's penalty
-has kinks where the facet that attains its gauge changes: p' jumps there. A step is therefore taken
-with the facets frozen, which makes the flow smooth, and cut where another facet takes over; there
-tangents (sensitivities) get the jump of a perturbed crossing time (the saltation matrix).
+Dormand and Prince's pair of orders 5 and 4 (1980), with local extrapolation. The running cost has
+kinks, where p' jumps: on a polygon's penalty where the facet that attains its gauge changes, and on
+the goal's boundary. A step is therefore taken with the facets frozen and the goal cost as it was,
+which makes the flow smooth, and cut where a kink is reached; there tangents (sensitivities) get the
+jump of a perturbed crossing time (the saltation matrix).
 """
 
 import math
@@ -35,7 +36,9 @@ TABLEAU[7] = 71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -
 
 MAX_STEPS = 2000  # in one call
 MAX_REJECTIONS = 40  # in a row
-LEVEL = 1e-13  # two facets whose gauges differ by less are level
+LEVEL = 1e-13  # a kink is reached to so much: gauges of two facets, squares of radii
+SKIN = 1e-10  # so far beyond the goal's boundary it is crossed, in squares of radii
+GOAL = -1  # the kink that is the goal's boundary, where polygons' numbers stand
 
 kernel_at = function_at(KERNEL)
 kernel_with_jacobian_at = function_at(KERNEL_WITH_JACOBIAN)
@@ -53,16 +56,30 @@ def _flow_addresses(k: Kernels) -> NDArray[np.intp]:
 
 
 def flow_layout(query: Query) -> NDArray[np.int64]:
-    """`[5]`: n, m, d, and where in q the obstacles are: first record, stride."""
+    """`[6]`: n, m, d, and where in q are: the number of obstacles, their stride, the goal."""
     layout = Layout.of(query)
-    return np.array([layout.n, layout.m, layout.d, layout.count, layout.stride], dtype=np.int64)
+    rows = [layout.n, layout.m, layout.d, layout.count, layout.stride, layout.goal]
+    return np.array(rows, dtype=np.int64)
 
 
-@compiled(types.void(VECTOR, VECTOR, INTEGERS, VECTOR, INTEGERS))
-def _freeze(x, q, layout, frozen, facets):
-    """Copy q into `frozen`, leaving each polygon only the facet that attains its gauge at x."""
-    d, count, stride = layout[2], layout[3], layout[4]
+@compiled(float64(VECTOR, VECTOR, INTEGERS))
+def _outside(x, q, layout):
+    """How far x lies outside the goal ball: square of the distance to its centre in radii, - 1."""
+    d, goal = layout[2], layout[5]
+    square = 0.0
+    for j in range(d):
+        square += (x[j] - q[goal + j]) ** 2
+    return square / q[goal + d] ** 2 - 1.0
+
+
+@compiled(types.void(VECTOR, VECTOR, INTEGERS, VECTOR))
+def _freeze(x, q, layout, frozen):
+    """Copy q into `frozen`, leaving each polygon only the facet that attains its gauge at x, and
+    taking away the goal cost if x is in the goal."""
+    d, count, stride, goal = layout[2], layout[3], layout[4], layout[5]
     frozen[:] = q
+    if _outside(x, q, layout) < 0.0:
+        frozen[goal + d + 1] = 0.0
     for o in range(int(q[count])):
         k = count + 1 + o * stride
         best, largest = 0, -np.inf
@@ -72,7 +89,6 @@ def _freeze(x, q, layout, frozen, facets):
                 gauge += q[k + 2 + d + d * i + j] * (x[j] - q[k + 2 + j])
             if gauge > largest:
                 best, largest = i, gauge
-        facets[o] = best
         if q[k] > 0.0:
             frozen[k] = 1.0
             for j in range(d):
@@ -81,9 +97,15 @@ def _freeze(x, q, layout, frozen, facets):
 
 @compiled(types.Tuple((float64, int64, int64))(VECTOR, VECTOR, INTEGERS, VECTOR))
 def _excess(x, q, layout, frozen):
-    """By how much a facet's gauge exceeds its polygon's frozen one at x; which polygon, facet."""
-    d, count, stride = layout[2], layout[3], layout[4]
-    worst, which, facet = -np.inf, -1, -1
+    """How far x lies beyond a kink, and which: a polygon (by how much the gauge of one of its
+    facets exceeds the frozen one) and its facet, or GOAL."""
+    d, count, stride, goal = layout[2], layout[3], layout[4], layout[5]
+    worst, which, facet = -np.inf, GOAL, 0
+    if q[goal + d + 1] > 0.0:
+        worst = _outside(x, q, layout)
+        if frozen[goal + d + 1] > 0.0:
+            worst = -worst
+        worst -= SKIN  # motions along the boundary must not go in and out by rounding
     for o in range(int(q[count])):
         k = count + 1 + o * stride
         for i in range(int(q[k])):
@@ -176,19 +198,32 @@ def _tangent_step(functions, q, y, h, sign, stages, tangents, scratch):
 
 @compiled(types.void(ADDRESSES, VECTOR, INTEGERS, VECTOR, VECTOR, int64, int64, MATRIX, MATRIX))
 def _switch(functions, q, layout, frozen, y, polygon, facet, stages, tangents):
-    """Let `facet` take over at y; jump of the tangents."""
+    """Go over to the other side of a kink at y: another facet, or in or out of the goal.
+
+    Perturbed motions cross it at other times, so the tangents jump.
+    """
     size, columns = tangents.shape
-    d, count, stride = layout[2], layout[3], layout[4]
-    k = count + 1 + polygon * stride
+    d, count, stride, goal = layout[2], layout[3], layout[4], layout[5]
     flow = kernel_at(functions[0, 0], functions[0, 1])
     before, after = stages[1], stages[2]
-    flow(y, frozen, before)
+    # Q is cut off in the goal, so its slope at the boundary is that from just outside.
+    point = y.copy()
+    if polygon == GOAL:
+        for j in range(d):
+            point[j] += 2.0 * SKIN * (y[j] - q[goal + j])
+    flow(point, frozen, before)
     normal = np.empty(d)
-    for j in range(d):
-        a = q[k + 2 + d + d * facet + j]
-        normal[j] = a - frozen[k + 2 + d + j]
-        frozen[k + 2 + d + j] = a
-    flow(y, frozen, after)
+    if polygon == GOAL:
+        frozen[goal + d + 1] = q[goal + d + 1] if frozen[goal + d + 1] == 0.0 else 0.0
+        for j in range(d):
+            normal[j] = y[j] - q[goal + j]
+    else:
+        k = count + 1 + polygon * stride
+        for j in range(d):
+            a = q[k + 2 + d + d * facet + j]
+            normal[j] = a - frozen[k + 2 + d + j]
+            frozen[k + 2 + d + j] = a
+    flow(point, frozen, after)
     speed = 0.0
     for j in range(d):
         speed += normal[j] * before[j]
@@ -234,8 +269,7 @@ def propagate(functions, q, layout, y, tangents, duration, tolerance, limits, re
     sign = 1.0 if duration >= 0.0 else -1.0
     length = abs(duration)
     frozen = np.empty_like(q)
-    facets = np.empty(int(q[layout[3]]), dtype=np.int64)
-    _freeze(y, q, layout, frozen, facets)
+    _freeze(y, q, layout, frozen)
     energy = scalar_at(functions[2, 0], functions[2, 1])(y, q)
     stages, out = np.empty((7, size)), np.empty(size)
     scratch = np.empty((7, 2 * n * tangents.shape[1]))

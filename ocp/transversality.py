@@ -22,7 +22,7 @@ from ocp.hamiltonian_flow import INTEGERS
 from ocp.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled
 from ocp.query import Query
 
-GOAL_AT_REST, GOAL_PUSHED, QUADRATIC = 0, 1, 2
+GOAL_AT_REST, GOAL_PUSHED, QUADRATIC, EXPONENTIAL = 0, 1, 2, 3
 
 NEGLIGIBLE = 1e-8  # running cost on the goal's boundary; see above
 # Just outside the goal, so that rounding cannot put the end where the goal cost is cut off.
@@ -37,7 +37,7 @@ class Condition:
     """How extremals end.
 
     Attributes:
-        kind: GOAL_AT_REST, GOAL_PUSHED or QUADRATIC.
+        kind: GOAL_AT_REST, GOAL_PUSHED, QUADRATIC or EXPONENTIAL.
         terms: the `terms` of `terminal_point`.
     """
 
@@ -47,7 +47,7 @@ class Condition:
     @property
     def at_goal(self) -> bool:
         """Whether the motion ends on the goal's boundary, at a free time; else at a fixed time."""
-        return self.kind != QUADRATIC
+        return self.kind in (GOAL_AT_REST, GOAL_PUSHED)
 
 
 @lru_cache(maxsize=1024)
@@ -68,6 +68,12 @@ def quadratic_condition(reference: ArrayLike, matrix: ArrayLike) -> Condition:
     """Anywhere, at the terminal cost (x - c)' P (x - c): c `[n]`, P `[n, n]` symmetric."""
     terms = np.concatenate([np.ravel(reference), np.ravel(matrix)]).astype(float)
     return Condition(QUADRATIC, terms)
+
+
+def exponential_condition(query: Query, steepness: float) -> Condition:
+    """Anywhere, at the terminal cost exp(a (|p - x_g|^2 - r_g^2)), a = `steepness`."""
+    terms = np.array([*query.goal.center, query.goal.radius, steepness])
+    return Condition(EXPONENTIAL, terms)
 
 
 def goal_boundary(query: Query, count: int) -> NDArray[np.float64]:
@@ -101,12 +107,13 @@ def terminal_point(kind, functions, q, layout, terms, end, z, tangents):
         kind: GOAL_AT_REST: on the goal's boundary, p = 0. GOAL_PUSHED: on the goal's boundary,
             p = nu times the outward normal in the position coordinates, else 0, with nu >= 0 from
             H = 0 and moving inward. QUADRATIC: anywhere, p = the gradient of
-            (x - c)' P (x - c).
+            (x - c)' P (x - c). EXPONENTIAL: anywhere, p = the gradient of
+            S = exp(a (|position - c|^2 - r^2)).
         functions, q, layout: as for `propagate`.
-        terms: the goal's centre `[d]` and radius; or c `[n]` and P `[n, n]`.
+        terms: the goal's centre `[d]` and radius; or c `[n]` and P `[n, n]`; or c `[d]`, r and a.
         end: replaced by the nearest state on the manifold.
         z: filled with [x, p].
-        tangents: `[2n, n - 1]` (QUADRATIC: `[2n, n]`), filled with dz by the manifold's
+        tangents: `[2n, n - 1]` at the goal, else `[2n, n]`; filled with dz by the manifold's
             coordinates: turns of the normal, then the other coordinates.
 
     Returns:
@@ -122,6 +129,23 @@ def terminal_point(kind, functions, q, layout, terms, end, z, tangents):
             for j in range(n):
                 z[n + i] += 2.0 * terms[n + n * i + j] * (end[j] - terms[j])
                 tangents[n + i, j] = 2.0 * terms[n + n * i + j]
+        return True
+    if kind == EXPONENTIAL:
+        exponent = -(terms[d] ** 2)
+        for j in range(d):
+            exponent += (end[j] - terms[j]) ** 2
+        exponent *= terms[d + 1]
+        if not exponent < 100.0:
+            return False
+        slope = 2.0 * terms[d + 1] * math.exp(exponent)
+        for i in range(n):
+            z[i] = end[i]
+            tangents[i, i] = 1.0
+        for i in range(d):
+            z[n + i] = slope * (end[i] - terms[i])
+            for j in range(d):
+                tangents[n + i, j] = 2.0 * terms[d + 1] * z[n + i] * (end[j] - terms[j])
+            tangents[n + i, i] += slope
         return True
 
     normal = np.empty(d)
