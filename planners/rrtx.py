@@ -225,7 +225,7 @@ class RRTX:
         return self._route
 
     def shortened(self) -> Route:
-        """The route with corners left out where that is free and shorter; takes milliseconds.
+        """The route with corners left out where that is free and shorter; may take 0.1 s.
 
         Raises:
             SolveError: if there is no route.
