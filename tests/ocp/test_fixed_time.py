@@ -82,8 +82,8 @@ def test_an_obstacle_course_agrees_with_collocation() -> None:
     query = paper_query((1.0, 1.0))
     terminal = np.diag([5.0, 5.0, 0.0])
     start = np.array([-3.0, -2.0, 0.3])
-    motion = solve_fixed_time(query, start, 2.5, terminal)
-    direct = solve_collocation(query, start, motion.trajectory, horizon=2.5, terminal_cost=terminal)
+    motion = solve_fixed_time(query, start, 1.5, terminal)
+    direct = solve_collocation(query, start, motion.trajectory, horizon=1.5, terminal_cost=terminal)
     assert (query.goal_distance(motion.trajectory.states) > 0).all()
     offset = direct.states[-1] - query.reference
     assert motion.value == pytest.approx(direct.cost + offset @ terminal @ offset, rel=1e-5)

@@ -57,7 +57,7 @@ def test_pushed_ends_lie_on_the_boundary_with_h_zero_moving_inward(model, bounde
         normal = (z[:d] - np.array(query.goal.center)) / query.goal.radius
         assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-9)
         assert_allclose(z[d:n], end[d:])
-        push = z[n : n + d] @ normal
+        push = float(z[n : n + d] @ normal)
         assert push >= 0
         assert_allclose(z[n:], np.concatenate([push * normal, np.zeros(n - d)]), atol=1e-9)
         if condition.kind == GOAL_PUSHED:
