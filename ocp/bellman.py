@@ -33,8 +33,8 @@ BELLMAN = types.FunctionType(
     )
 )  # fmt: skip
 SCRATCH_ROWS = 7
-SLACK = 0.3
-NEAR = 2.0
+SLACK = 0.3  # share of a step's cost by which the gradient's input may miss the Bellman equation
+NEAR = 1.0  # cells from the goal within which the gradient is not used: V is a square root there
 OVERSHOOT = 1.2  # a step that speeds up is shortened until it exceeds its cells by no more
 MAX_SHORTENINGS = 6
 ARRIVAL_DIRECTIONS = 64
@@ -311,10 +311,10 @@ def bellman(x, u, candidates, spread, rounds, functions, q, settings, values, ge
 def feedback(x, u, candidates, spread, rounds, functions, q, settings, values, geometry, scratch):
     """The input of a policy at `x` `[n]`, in `u` `[m]`; returns its `step_cost`.
 
-    The gradient of V by differences over a cell to both sides of `x` is of second order and gives
-    the best input, but not where two motions are equally good (it averages theirs), nor next to
-    infinite values. So its input is taken if a step under it loses no more than `SLACK` of its
-    cost against V(x), as the Bellman equation demands, and `bellman`'s otherwise.
+    The gradient of V by differences over a cell to both sides of `x` (as `GridValue.gradient`) is
+    of second order and gives the better input, but not where two motions are equally good (it
+    averages theirs), nor next to infinite values or the goal. So its input is taken if a step under
+    it keeps the Bellman equation up to `SLACK` of its cost, else that of `bellman`.
     """
     n, m = x.shape[0], u.shape[0]
     mixed_value = interpolation_at(functions[2, 0], functions[2, 1])

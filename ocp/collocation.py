@@ -21,9 +21,9 @@ from ocp.transcription import (
     TIME_PRICE,
     Problem,
     Program,
-    Structure,
     program,
 )
+from ocp.transcription_terms import Structure
 
 Array = NDArray[np.float64]
 
@@ -35,6 +35,7 @@ MAX_MARGIN = 1e-2  # metres; a motion that enters an obstacle deeper needs a fin
 ROUNDS = 16
 MAX_MOVES = 3  # of the mesh, before its intervals double
 MAX_BREACHES = 5
+STRAY = 0.1  # relative difference of cost beyond which a warm start did not stay near its guess
 DUPLICATE = 1e-6  # relative difference of cost below which two answers count as one
 
 
@@ -59,7 +60,8 @@ def solve_collocation(
     minimises running cost plus (x - x_g)' P_T (x - x_g) at the end; the trajectory's cost is the
     running cost alone.
 
-    The answer is a local optimum near the guess. Without a guess several are tried (either side of
+    The answer is a local optimum, as a rule the one near the guess; where obstacles give the cost
+    kinks it may be another one. Without a guess several are tried (either side of
     obstacles, driving forward and backward) and the cheapest answer is kept.
 
     Args:
@@ -154,8 +156,7 @@ class _Search:
         coarse: list[CollocatedMotion] = []
         for guess in guesses:
             try:
-                mesh = self._first_mesh(guess)
-                coarse.append(self._loose(guess, mesh, self._first_margin))
+                coarse.append(self._first(guess))
             except SolveError as failure:
                 failures.append(failure)
         best: CollocatedMotion | None = None
@@ -178,13 +179,30 @@ class _Search:
             raise _gravest(failures)
         return best
 
-    def _first_mesh(self, guess: Trajectory) -> Array:
-        """Even, or as the points of a guess that is itself a solution."""
-        mesh = np.linspace(0.0, 1.0, self.intervals + 1)
+    def _first(self, guess: Trajectory) -> CollocatedMotion:
+        """Solve from a guess.
+
+        One with costates is a solution, perhaps of a neighbouring problem: the mesh follows its
+        points, and an answer of quite another cost has strayed, so that a finer mesh is tried.
+        """
+        even = np.linspace(0.0, 1.0, self.intervals + 1)
         if guess.costates is None:
-            return mesh
+            return self._loose(guess, even, self._first_margin)
         points = np.unique(guess.times) / guess.duration
-        return np.interp(mesh, np.linspace(0.0, 1.0, len(points)), points)
+        strayed: CollocatedMotion | None = None
+        for count in (self.intervals, min(2 * self.intervals, self.max_intervals)):
+            places = np.linspace(0.0, len(points) - 1.0, count + 1)
+            mesh = np.interp(places, np.arange(len(points)), points)
+            try:
+                motion = self._bounded(guess, mesh, self._first_margin)
+            except SolveError as failure:
+                if failure.status is Status.TIME_LIMIT:
+                    raise
+                continue
+            if abs(motion.cost / guess.cost - 1) < STRAY:
+                return motion
+            strayed = strayed or motion
+        return strayed or self._loose(guess, even, self._first_margin)
 
     @property
     def _first_margin(self) -> float:
@@ -208,34 +226,46 @@ class _Search:
     ) -> CollocatedMotion:
         """Solve on a mesh with a large price of time, which guides the duration.
 
-        The cap on the duration is raised while the answer lies at it. Should a guess's costates
-        mislead, the rest of it is used alone.
+        Should a guess's costates mislead, the rest of it is used alone.
         """
+        try:
+            return self._bounded(guess, mesh, margin)
+        except SolveError as failure:
+            if guess.costates is None or failure.status is Status.TIME_LIMIT:
+                raise
+            plain = guess.trajectory() if isinstance(guess, CollocatedMotion) else guess
+            return self._bounded(replace(plain, costates=None), mesh, margin)
+
+    def _bounded(
+        self, guess: Trajectory | CollocatedMotion, mesh: Array, margin: float
+    ) -> CollocatedMotion:
+        """Solve on a mesh; the cap on the duration is raised while the answer lies at it."""
         cap = CAP * guess.duration
         while cap <= MAX_CAP * guess.duration:
             problem = self._problem(mesh, cap, margin)
             ready = self._program(len(mesh) - 1)
-            try:
-                motion = ready.solve(problem, guess, FIRST_TIME_PRICE, self.deadline)
-            except SolveError as failure:
-                if guess.costates is None or failure.status is Status.TIME_LIMIT:
-                    raise
-                plain = guess.trajectory() if isinstance(guess, CollocatedMotion) else guess
-                plain = replace(plain, costates=None)
-                motion = ready.solve(problem, plain, FIRST_TIME_PRICE, self.deadline)
+            motion = ready.solve(problem, guess, FIRST_TIME_PRICE, self.deadline)
             if self.horizon is not None or motion.duration < 0.99 * cap:
                 return motion
             cap *= CAP
         raise _unbounded(cap / CAP)
 
-    def _tight(self, loose: CollocatedMotion, margin: float) -> CollocatedMotion:
-        """The answer proper: from a loose one, with a negligible price of time."""
+    def _tight(self, loose: CollocatedMotion, margin: float) -> CollocatedMotion | None:
+        """The answer proper: from a loose one, with a negligible price of time.
+
+        `None` if the mesh is too coarse for that to converge.
+        """
         if self.horizon is not None:
             return loose
         cap = CAP * loose.duration
         problem = self._problem(loose.mesh, cap, margin)
         ready = self._program(len(loose.durations))
-        motion = ready.solve(problem, loose, TIME_PRICE, self.deadline)
+        try:
+            motion = ready.solve(problem, loose, TIME_PRICE, self.deadline)
+        except SolveError as failure:
+            if failure.status is Status.TIME_LIMIT:
+                raise
+            return None
         if motion.duration > 0.99 * cap:
             raise _unbounded(cap)
         return motion
@@ -247,9 +277,9 @@ class _Search:
         moves = breaches = 0
         for _ in range(ROUNDS):
             motion = self._tight(loose, margin)
-            verdict = judge(motion, self.horizon is None)
-            mesh = motion.mesh
-            if verdict.depth > MAX_MARGIN or not self._agrees(motion, verdict):
+            verdict = judge(motion or loose, self.horizon is None)
+            mesh, errors = loose.mesh, np.abs(verdict.errors)
+            if motion is None or verdict.depth > MAX_MARGIN or not self._agrees(motion, verdict):
                 if verdict.depth > MAX_MARGIN:
                     trouble = f"the motion enters a hard obstacle by {verdict.depth:.2g} m"
                     errors = np.where(verdict.breached, 1.0, 1e-9)
@@ -257,11 +287,13 @@ class _Search:
                     if breaches > MAX_BREACHES:
                         status = Status.INFEASIBLE
                         break
+                elif motion is None:
+                    trouble = "the final time does not settle"
                 else:
-                    errors = np.abs(verdict.errors)
                     trouble = f"costs differ by {errors.sum():.1e}, states by {verdict.gap:.1e}"
                 # A kink of the cost spoils few intervals: these shrink before there are more.
-                few = np.sort(errors)[-4:].sum() > 0.9 * errors.sum() and moves < MAX_MOVES
+                few = motion is not None and moves < MAX_MOVES
+                few = few and np.sort(errors)[-4:].sum() > 0.9 * errors.sum()
                 moves = moves + 1 if few else 0
                 count = (len(mesh) - 1) * (1 if few else 2)
                 if count > self.max_intervals:

@@ -43,6 +43,8 @@ LONGEST_TURN = 8.0  # goal radii; see `can_tabulate`
 LONGEST_TABLE = 60.0  # turning lengths
 SHORTEST_TIME = 30.0  # times shorter than that for turning by one radian
 PROBE = 1e-5
+GROWTH = 0.02  # of steps, from one to the next
+RAYS_AT_ONCE = 16
 STARTING_STEPS = 16  # shorter, as d grows like the time squared
 MARGIN = 0.5  # how far rays go on beyond psi = 0, in units of psi_c
 
@@ -69,12 +71,19 @@ class Drive:
         """Turning length l, metres a radian."""
         return math.sqrt(self.drive / self.turn)
 
-    def time_scale(self, radius: float) -> float:
-        """The shortest time in which an extremal changes: at the goal's boundary, or far away."""
-        slope = self.weight * self.steepness * radius  # of Q at the boundary
-        near = (4.0 / (self.drive * self.turn * slope**2)) ** 0.25
-        saturates = 1.0 / (self.steepness * radius) / math.sqrt(self.weight * self.drive)
-        return min(near, 2.0 * saturates, 1.0 / math.sqrt(self.weight * self.turn))
+    @property
+    def turning(self) -> float:
+        """Seconds to turn by one radian, far from the goal."""
+        return 1.0 / math.sqrt(self.weight * self.turn)
+
+    def leaving(self, radius: float) -> float:
+        """Seconds in which headings part at the goal's boundary, where Q has a slope."""
+        slope = self.weight * self.steepness * radius
+        return (4.0 / (self.drive * self.turn * slope**2)) ** 0.25
+
+    def saturating(self, radius: float) -> float:
+        """Seconds to drive straight from the boundary to where Q levels off."""
+        return 2.0 / (self.steepness * radius * math.sqrt(self.weight * self.drive))
 
 
 def can_tabulate(drive: Drive, radii: tuple[float, float], reach: float) -> bool:
@@ -84,11 +93,10 @@ def can_tabulate(drive: Drive, radii: tuple[float, float], reach: float) -> bool
     just misses the goal. Far from the goal, rays part like exp(d / l). Where Q is very steep, steps
     in time would have to be very short.
     """
-    short = 1.0 / math.sqrt(drive.weight * drive.turn) / drive.time_scale(radii[1])
     return (
         drive.unit <= LONGEST_TURN * radii[0]
         and reach <= LONGEST_TABLE * drive.unit
-        and short <= SHORTEST_TIME
+        and drive.turning <= SHORTEST_TIME * drive.saturating(radii[1])
     )
 
 
@@ -112,18 +120,15 @@ def tabulate(query: Query, drive: Drive, reach: float) -> Floats:
     u = U_FIRST + U_STEP * np.arange(row_count(drive.unit, reach), dtype=float)
     far = drive.unit * (math.exp(u[-1]) - SOFT) ** 2
     radius = query.goal.radius
-    step = TIME_STEP * drive.time_scale(radius)
+    steps = _steps(drive, radius, far)
     facing = np.exp(np.arange(-far / drive.unit - 8.0, math.log(math.pi / 4), RAY_GAP))
-    slowest = math.sqrt(drive.weight * drive.drive) * step
-    turning = 1.0 / math.sqrt(drive.weight * drive.turn)
-    count = math.ceil(far / slowest + 10.0 * turning / step + 10.0 / TIME_STEP)
 
     def trace(headings: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        points = np.empty((len(headings), count, 5))
+        points = np.empty((len(headings), len(steps), 5))
         lengths = np.zeros(len(headings), dtype=np.int64)
         _trace(
             kernels(query).flow, parameters(query), np.array(query.goal.center), radius,
-            drive.unit, step, far, headings, points, lengths,
+            drive.unit, steps, far, headings, points, lengths,
         )  # fmt: skip
         _smooth(points, lengths, radius, drive.unit)
         return points, lengths
@@ -132,14 +137,36 @@ def tabulate(query: Query, drive: Drive, reach: float) -> Floats:
     probe, lengths = trace(np.array([math.pi / 2 - PROBE]))
     met = (math.exp(probe[0, lengths[0] - 1, 0]) - SOFT) / PROBE
     grazing = np.exp(np.arange(math.log(math.pi / 4), math.log(RHO_FIRST / met / 10), -RAY_GAP))
-    points, lengths = trace(np.concatenate([[0.0], facing, math.pi / 2 - grazing]))
+    headings = np.concatenate([[0.0], facing, math.pi / 2 - grazing])
     table = np.full((len(u), S_COUNT), np.inf)
-    crossings = _rasterise(points, lengths, table)
-    table[:, -1] = _aligned(points[0, 1 : lengths[0]], u)
+    crossings = 0
+    for first in range(0, len(headings) - 1, RAYS_AT_ONCE):
+        points, lengths = trace(headings[first : first + RAYS_AT_ONCE + 1])
+        crossings += _rasterise(points, lengths, table)
+        if first == 0:
+            table[:, -1] = _aligned(points[0, 1 : lengths[0]], u)
     missing = int((~np.isfinite(table)).sum())
     if crossings or missing:
         raise ArithmeticError(f"rays cross at {crossings} nodes and miss {missing}")
     return table
+
+
+def _steps(drive: Drive, radius: float, far: float) -> Floats:
+    """Steps in time of all rays: short while any is near the boundary, then longer."""
+    last = TIME_STEP * drive.turning
+    first = min(last, TIME_STEP * drive.leaving(radius), TIME_STEP * drive.saturating(radius))
+    near = 6.0 * drive.leaving(radius) + 4.0 * drive.saturating(radius)
+    start = first * np.arange(1, STARTING_STEPS) / STARTING_STEPS
+    growing = first * np.exp(np.arange(0.0, math.log(last / first), GROWTH))
+    rest = far / math.sqrt(drive.weight * drive.drive) + 10.0 * drive.turning
+    return np.concatenate(
+        [
+            start,
+            np.full(math.ceil(near / first), first),
+            growing,
+            np.full(math.ceil(rest / last), last),
+        ]
+    )
 
 
 def _aligned(ray: Floats, u: Floats) -> Floats:
@@ -181,11 +208,11 @@ def _smooth(points, lengths, radius, unit):
 
 @compiled(
     types.void(
-        KERNEL, VECTOR, VECTOR, float64, float64, float64, float64, VECTOR,
+        KERNEL, VECTOR, VECTOR, float64, float64, VECTOR, float64, VECTOR,
         float64[:, :, ::1], int64[::1],
     )
 )  # fmt: skip
-def _trace(flow, q, center, radius, unit, step, far, headings, points, lengths):
+def _trace(flow, q, center, radius, unit, steps, far, headings, points, lengths):
     """Classical Runge-Kutta backward from the boundary, at the same times on every ray.
 
     Equal times keep neighbouring rays' points side by side. V grows by -p . x' (backward), which is
@@ -217,7 +244,7 @@ def _trace(flow, q, center, radius, unit, step, far, headings, points, lengths):
             back = psi < 0.0 and psi > points[ray, k - 1, 1]
             if beyond or back or d > far * 1.02 + 0.1 * unit or psi > math.pi:
                 break
-            h = step * min(1.0, (k + 1) / STARTING_STEPS)
+            h = steps[k]
             y[:] = z
             total[:] = 0.0
             for stage in range(4):

@@ -1,8 +1,8 @@
 """Hard obstacles for compiled solvers: clearance, clear segments, and what a grid may mix.
 
-`HardObstacles.data` is one vector that carries the hard obstacles of a query into numba kernels:
-[d, robot radius, count], then for each obstacle [k, centre `[d]`, radius, k vertices `[2]`], with
-k = 0 for a ball. The geometry is that of `Obstacle.signed_distance`, compiled.
+`hard_data` is one vector that carries the hard obstacles of a query into numba kernels: [d, robot
+radius, count, cost of a metre], then for each obstacle [k, centre `[d]`, radius, k vertices `[2]`],
+with k = 0 for a ball. The geometry is that of `Obstacle.signed_distance`, compiled.
 
 A grid sees an obstacle through moves between its nodes: a node may use another's value only if the
 straight segment between their positions is clear of hard obstacles. Then a value is passed on along
@@ -30,7 +30,8 @@ MAX_MOVES = 62
 def hard_data(query: Query, margin: float = 0.0) -> NDArray[np.float64]:
     """The hard obstacles of `query` as one vector; `margin` metres are added to the robot."""
     d = len(query.system.position)
-    parts = [np.array([d, query.robot_radius + margin, len(query.hard_obstacles)], dtype=float)]
+    metre = 2 * np.sqrt(query.cost.goal * query.input_weights.max())  # at the best speed of p' = u
+    parts = [[d, query.robot_radius + margin, len(query.hard_obstacles), metre]]
     for o in query.hard_obstacles:
         parts += [[len(o.vertices)], o.center, [o.radius], np.array(o.vertices, float).ravel()]
     return np.concatenate([np.asarray(p, dtype=float) for p in parts])
@@ -41,7 +42,7 @@ def clearance(point, data):
     """Distance from the robot's ball at `point` `[>= d]` to the nearest hard obstacle."""
     d, count = int(data[0]), int(data[2])
     nearest = np.inf
-    at = 3
+    at = 4
     for _ in range(count):
         k, center, corners = int(data[at]), at + 1, at + d + 2
         if k == 0:
@@ -103,9 +104,10 @@ def _mixed(values, geometry, point, strict):
     if gap < 0.0:
         return np.inf
     d = int(data[0])
-    reach = 0.0
+    reach, cell = 0.0, 0.0
     for i in range(d):
         reach += 1.0 / geometry[n + i] ** 2
+        cell = max(cell, 1.0 / geometry[n + i])
     check = gap < math.sqrt(reach)
     index = np.zeros(2 * MAX_DIMENSION, dtype=np.int64)
     weight = np.zeros(2 * MAX_DIMENSION)
@@ -148,7 +150,9 @@ def _mixed(values, geometry, point, strict):
             weights += w
         elif strict:
             return np.inf
-    return total / weights if weights > 0.0 else np.inf
+    if not weights > 0.0:
+        return np.inf
+    return total / weights + (1.0 - min(weights, 1.0)) * cell * data[3]
 
 
 @compiled(float64(VECTOR, VECTOR, VECTOR))
@@ -165,9 +169,10 @@ def interpolate_joined(values, geometry, point):
 def interpolate_visible(values, geometry, point):
     """As `interpolate_joined`, but from those corners alone that are finite and joined to `point`.
 
-    Their weights are scaled to sum to 1, so that a point beside an obstacle has a value; it may be
-    too low by the effort of crossing a cell. Infinite outside the box, inside an obstacle, and
-    where no corner is left.
+    Their weights are scaled to sum to 1, so that a point beside an obstacle has a value. Their mean
+    belongs to a point up to a cell away: the way there is added, as the cost of that share of a
+    cell; or else a robot would cling to obstacles. Infinite outside the box, inside an obstacle,
+    and where no corner is left.
     """
     return _mixed(values, geometry, point, False)
 

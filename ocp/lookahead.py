@@ -1,8 +1,9 @@
-"""Feedback by one-step lookahead: the best step of about one cell, then the interpolated value.
+"""Feedback on grid values: the gradient's input if a lookahead confirms it, else the lookahead's.
 
-Reading the control off the nearest node cycles, and a multilinear value's gradient jumps from cell
-to cell; a lookahead averages over a cell. The best sampled input is refined, so that the control
-is not quantised.
+Reading the control off the nearest node cycles, and off the derivative of a multilinear value it
+jumps from cell to cell. Differences over two cells give a gradient of second order, whose control
+is the best where V is smooth. Where it is not, a lookahead decides: the best step of about one
+cell, refined so that the control is not quantised, with the interpolated value at its end.
 """
 
 from dataclasses import dataclass
@@ -34,7 +35,8 @@ scalar_at = function_at(SCALAR)
 
 @dataclass(frozen=True, eq=False)
 class LookaheadPolicy:
-    """u(x) = argmin over u of the cost of a step of about one cell, plus V at its end.
+    """u(x) = argmin over u of the cost of a step of about one cell, plus V at its end; or the input
+    that minimises the Hamiltonian with V's gradient, where such a step confirms it.
 
     For a time-free query u has the size that is optimal, u' R u = W(x). The input is 0 in the goal,
     and where no step leads to a finite value (there V is infinite: the robot stands still). From

@@ -26,12 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp import cost as costs
-from ocp.kernels import Layout, parameters
-from ocp.obstacle import Obstacle
+from ocp.kernels import parameters
 from ocp.query import Query
 from ocp.radau import CollocatedMotion, radau
-from ocp.system import System
 from ocp.trajectory import SolveError, Status, Trajectory
+from ocp.transcription_terms import Structure, clearance, reference, state_cost, symbol
 
 Array = NDArray[np.float64]
 
@@ -58,53 +57,6 @@ WARM = {
     "warm_start_slack_bound_frac": PUSH,
     "warm_start_mult_bound_push": PUSH,
 }
-
-
-@dataclass(frozen=True)
-class Structure:
-    """What a program is built for; everything else about a query is a parameter.
-
-    Attributes:
-        system: the robot.
-        layout: where each number of the query stands in its parameter vector.
-        facets: for each obstacle its number of facets, 0 for a ball.
-        hard: the hard obstacles, built in as constants.
-        inflated: whether the robot has a radius.
-        intervals, degree: the mesh.
-        ends_at_goal: free final time, on the goal's boundary; else fixed time.
-        max_iterations: of IPOPT.
-    """
-
-    system: System
-    layout: Layout
-    facets: tuple[int, ...]
-    hard: tuple[Obstacle, ...]
-    inflated: bool
-    intervals: int
-    degree: int
-    ends_at_goal: bool
-    max_iterations: int
-
-    @classmethod
-    def of(
-        cls,
-        query: Query,
-        intervals: int,
-        degree: int = 3,
-        ends_at_goal: bool = True,
-        max_iterations: int = 300,
-    ) -> "Structure":
-        return cls(
-            query.system,
-            Layout.of(query),
-            tuple(len(o.facets) for o in query.obstacles),
-            query.hard_obstacles,
-            query.robot_radius > 0,
-            intervals,
-            degree,
-            ends_at_goal,
-            max_iterations,
-        )
 
 
 @dataclass(frozen=True)
@@ -163,16 +115,16 @@ class Program:
         self.structure = structure
         layout, d, k = structure.layout, structure.degree, structure.intervals
         n, m = layout.n, layout.m
-        q = _symbol("q", layout.count + 1 + layout.stride * len(structure.facets))
-        shares, margin, offset, price = (_symbol("s", k), *map(_symbol, ("margin", "offset", "e")))
-        terminal = _symbol("P", n, n)
+        q = symbol("q", layout.count + 1 + layout.stride * len(structure.facets))
+        shares, margin, offset, price = (symbol("s", k), *map(symbol, ("margin", "offset", "e")))
+        terminal = symbol("P", n, n)
         interval = self._interval()
 
-        start = _symbol("x0", n)
+        start = symbol("x0", n)
         variables, constraints = [start], []
         total, before, before_duration = ca.SX(0), start, None
         for i in range(k):
-            states, inputs, h = _symbol(f"x{i}", n, d), _symbol(f"u{i}", m, d), _symbol(f"h{i}")
+            states, inputs, h = symbol(f"x{i}", n, d), symbol(f"u{i}", m, d), symbol(f"h{i}")
             held, run = interval(before, states, inputs, h, q, margin, offset)
             total += run + price * h
             variables += [ca.vec(states), ca.vec(inputs), h]
@@ -181,7 +133,7 @@ class Program:
                 constraints.append(k * (h * shares[i - 1] - before_duration * shares[i]))
             before, before_duration = states[:, -1], h
         if not structure.ends_at_goal:
-            total += costs.quadratic_cost(before, _reference(structure, q), terminal)
+            total += costs.quadratic_cost(before, reference(structure, q), terminal)
         x, g = ca.vertcat(*variables), ca.vertcat(*constraints)
         numbers = ca.vertcat(q, shares, margin, offset, price, ca.vec(terminal))
         sizes = {"x": x.numel(), "f": 1, "g": g.numel()}
@@ -216,9 +168,9 @@ class Program:
         s = self.structure
         layout, d = s.layout, s.degree
         n, m, rule = layout.n, layout.m, radau(d)
-        start, h, margin, offset = _symbol("a", n), *map(_symbol, ("h", "margin", "offset"))
-        states, inputs = _symbol("x", n, d), _symbol("u", m, d)
-        q = _symbol("q", layout.count + 1 + layout.stride * len(s.facets))
+        start, h, margin, offset = symbol("a", n), *map(symbol, ("h", "margin", "offset"))
+        states, inputs = symbol("x", n, d), symbol("u", m, d)
+        q = symbol("q", layout.count + 1 + layout.stride * len(s.facets))
         nodes = ca.horzcat(start, states)
         slopes = nodes @ ca.DM(rule.derivative.T)
         held, run = [], ca.SX(0)
@@ -233,9 +185,7 @@ class Program:
             held.append(squared.T - (radius + offset) ** 2)
         everywhere = ca.horzcat(states, nodes @ ca.DM(rule.between.T))[place, :]
         held += [
-            _clearance(o, everywhere[:, i], margin, s.inflated)
-            for o in s.hard
-            for i in range(2 * d)
+            clearance(o, everywhere[:, i], margin, s.inflated) for o in s.hard for i in range(2 * d)
         ]
         return ca.Function(
             "interval", [start, states, inputs, h, q, margin, offset], [ca.vertcat(*held), run]
@@ -403,52 +353,3 @@ class Program:
 def program(structure: Structure) -> Program:
     """The program of a structure, built once."""
     return Program(structure)
-
-
-def state_cost(structure: Structure, x: ca.SX, q: ca.SX) -> ca.SX:
-    """W(x) with the query's numbers as symbols `q`, laid out as `kernels.parameters`."""
-    layout = structure.layout
-    n, d = layout.n, layout.d
-    position = x[list(structure.system.position)]
-    at = layout.goal + d
-    total = costs.goal_cost(position, q[layout.goal : at], q[at], q[at + 1], q[at + 2])
-    if layout.quadratic:
-        M = q[layout.state + n : layout.state + n + n * n].reshape((n, n))
-        total += costs.quadratic_cost(x, _reference(structure, q), M)
-    for i, facets in enumerate(structure.facets):
-        k = layout.count + 1 + i * layout.stride
-        shape = (q[k + 1], q[at + 3], q[at + 4])
-        center, rows = q[k + 2 : k + 2 + d], q[k + 2 + d : k + 2 + d + d * facets]
-        if facets:
-            rows = rows.reshape((d, facets)).T
-            total += costs.polygon_penalty(position, center, rows, *shape)
-        else:
-            total += costs.ball_penalty(position, center, *shape)
-    return total
-
-
-def _reference(structure: Structure, q: ca.SX) -> ca.SX:
-    reference = ca.SX.zeros(structure.layout.n, 1)
-    for i, index in enumerate(structure.system.position):
-        reference[index] = q[structure.layout.goal + i]
-    return reference
-
-
-def _clearance(o: Obstacle, position: ca.SX, needed: ca.SX, inflated: bool) -> ca.SX:
-    """An expression that is >= 0 only where the distance to `o` is at least `needed`.
-
-    The signed distance has no derivative at a disc's centre nor on a polygon's boundary. For a
-    point robot that boundary is where the constraint is active, so there the largest distance to a
-    facet's line stands in: equal but at corners, where it asks for a little more.
-    """
-    if not o.vertices:
-        return ca.sumsqr(position - ca.DM(o.center)) - (o.radius + needed) ** 2
-    if inflated:
-        return o.signed_distance_expression(position) - needed
-    lengths = ca.DM(np.linalg.norm(o.facets, axis=1))
-    depth = ca.mmax((ca.DM(o.facets) @ (position - ca.DM(o.center)) - 1) / lengths)
-    return depth - needed  # pyright: ignore[reportOperatorIssue]
-
-
-def _symbol(name: str, *shape: int) -> ca.SX:
-    return ca.SX.sym(name, *shape)  # pyright: ignore[reportCallIssue, reportArgumentType]

@@ -21,7 +21,8 @@ from ocp.query_family import paper_query
 from ocp.radau import radau
 from ocp.riccati import LinearQuadratic, differential_riccati
 from ocp.trajectory import SolveError, Status
-from ocp.transcription import Problem, Structure, program, state_cost
+from ocp.transcription import Problem, program
+from ocp.transcription_terms import Structure, state_cost
 
 START = np.array([-4.0, -4.0, -np.pi / 4])
 TERMINAL = 0.7 * np.eye(2) + 0.1

@@ -126,17 +126,26 @@ def test_periodic_axes_wrap(n: int, seed: int, turns: int) -> None:
 
 
 @given(dimensions, seeds)
-def test_the_gradient_is_that_of_the_interpolant(n: int, seed: int) -> None:
+def test_the_gradient_is_exact_for_quadratic_functions(n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    value = random_value(rng, n)
-    grid = value.grid
-    # Points well inside a cell, where the interpolant is linear along each axis.
-    cell = rng.integers(0, np.array(grid.shape) - 1, (20, n))
-    x = grid.lower + (cell + rng.uniform(0.2, 0.8, (20, n))) * grid.spacing
-    for i in range(n):
-        step = 0.1 * grid.spacing[i] * np.eye(n)[i]
-        slope = (value.value(x + step) - value.value(x - step)) / (0.2 * grid.spacing[i])
-        np.testing.assert_allclose(value.gradient(x)[:, i], slope, rtol=1e-6, atol=1e-9)
+    lower = rng.uniform(-3, 0, n)
+    upper = lower + rng.uniform(0.5, 4, n)
+    grid = Grid(tuple(lower), tuple(upper), (7,) * n, (False,) * n)
+    A, b = rng.normal(size=(n, n)), rng.normal(size=n)
+    nodes = grid.nodes()
+    value = GridValue(grid, np.einsum("...i,ij,...j", nodes, A, nodes) + nodes @ b)
+    x = rng.uniform(lower + grid.spacing, upper - grid.spacing, (50, n))
+    np.testing.assert_allclose(value.gradient(x), x @ (A + A.T) + b, atol=1e-9)
+
+
+def test_the_gradient_is_of_second_order_and_wraps() -> None:
+    errors = []
+    x = np.random.default_rng(0).uniform(0, 7, (200, 1))
+    for count in (20, 40):
+        grid = Grid((0.0,), (2 * np.pi,), (count,), (True,))
+        value = GridValue(grid, np.sin(grid.axes[0]))
+        errors.append(abs(value.gradient(x) - np.cos(x)).max())
+    assert 3.5 < errors[0] / errors[1] < 4.5
 
 
 @given(dimensions, seeds)
