@@ -8,7 +8,7 @@ coefficients, and L = mat(l)/2 = B'P. Then -dP/dt = M + H - L'R^-1 L.
 import numpy as np
 from numba import float64, int64, njit, types
 
-from ocp.jit import MATRIX, VECTOR, compiled
+from ocp.compiled.jit import MATRIX, VECTOR, compiled
 
 # Dormand and Prince, 1980: fifth order with an embedded fourth; the last stage is the next first.
 _STAGES = np.array(

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import boolean, njit, types
 
-from ocp.jit import MATRIX, VECTOR, compiled
+from ocp.compiled.jit import MATRIX, VECTOR, compiled
 
 
 @njit(cache=True, error_model="numpy")

@@ -25,7 +25,7 @@ import numpy as np
 from numba import float64, int64, njit, types
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.jit import MATRIX, VECTOR, compiled
+from ocp.compiled.jit import MATRIX, VECTOR, compiled
 
 Array = NDArray[np.float64]
 

@@ -11,19 +11,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.collocation_check import ReplayVerdict, judge
-from ocp.guess import default_guesses
+from ocp.extremals.guess import default_guesses
 from ocp.query import Query
-from ocp.radau import CollocatedMotion
 from ocp.trajectory import SolveError, Status, Trajectory
-from ocp.transcription import (
+from ocp.transcription.check import ReplayVerdict, judge
+from ocp.transcription.programme import (
     FIRST_TIME_PRICE,
     TIME_PRICE,
     Problem,
     Program,
     program,
 )
-from ocp.transcription_terms import Structure
+from ocp.transcription.radau import CollocatedMotion
+from ocp.transcription.terms import Structure
 
 Array = NDArray[np.float64]
 

@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.bellman import bellman_geometry
-from ocp.fixed_point import FixedPoint
 from ocp.grid import Grid, GridValue
-from ocp.hard_obstacles import interpolate_visible_rows
-from ocp.lookahead import LookaheadPolicy
+from ocp.grids.bellman import bellman_geometry
+from ocp.grids.fixed_point import FixedPoint
+from ocp.grids.hard_obstacles import interpolate_visible_rows
+from ocp.grids.lookahead import LookaheadPolicy
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status
 
@@ -155,14 +155,14 @@ def solve_eikonal(
 
 def _solve(query: Query, grid: Grid, scheme: Scheme) -> FixedPoint:
     if scheme is Scheme.FAST_MARCHING:
-        from ocp.fast_marching import marched
+        from ocp.grids.fast_marching import marched
 
         answer = marched(query, grid)
         return FixedPoint(answer.values, 1, len(answer.accepted), 0.0, 0.0)
     if scheme is Scheme.SEMI_LAGRANGIAN:
-        from ocp.semi_lagrangian import sweep_time_free
+        from ocp.grids.semi_lagrangian import sweep_time_free
 
         return sweep_time_free(query, grid)
-    from ocp.value_iteration import iterate_values
+    from ocp.grids.value_iteration import iterate_values
 
     return iterate_values(query, grid)

@@ -10,7 +10,7 @@ import numpy as np
 from numba import types
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.jit import MATRIX, VECTOR, compiled, float64
+from ocp.compiled.jit import MATRIX, VECTOR, compiled, float64
 from ocp.query import Query
 from ocp.system import System
 

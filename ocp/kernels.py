@@ -17,10 +17,10 @@ from hashlib import sha256
 from types import ModuleType
 from typing import Any
 
+from ocp.compiled.jit import cache_folder
+from ocp.compiled.kernel_source import kernel_source
+from ocp.compiled.parameters import Layout, parameters
 from ocp.files import write_text
-from ocp.jit import cache_folder
-from ocp.kernel_source import kernel_source
-from ocp.parameters import Layout, parameters
 from ocp.query import Query
 from ocp.system import System
 

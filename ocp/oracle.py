@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.closed_form import straight_value
 from ocp.collocation import solve_collocation
-from ocp.extremal import find_extremal
+from ocp.extremals.extremal import find_extremal
 from ocp.pontryagin import exact_trajectory
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status, Trajectory

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.candidates import candidate_guesses
 from ocp.collocation import solve_collocation
-from ocp.extremal import Extremal, find_extremal
+from ocp.extremals.candidates import candidate_guesses
+from ocp.extremals.extremal import Extremal, find_extremal
+from ocp.extremals.warm_start import onward, policy_of, rollouts
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status, Trajectory
 from ocp.value import Policy, Value
-from ocp.warm_start import onward, policy_of, rollouts
 
 Array = NDArray[np.float64]
 

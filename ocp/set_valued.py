@@ -19,12 +19,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.batch import rates, state_costs
+from ocp.compiled.batch import rates, state_costs
 from ocp.grid import Grid, GridValue
-from ocp.hard_obstacles import hard_data
-from ocp.lookahead import LookaheadPolicy
+from ocp.grids.hard_obstacles import hard_data
+from ocp.grids.lookahead import LookaheadPolicy
+from ocp.grids.shortest_path import MoveGraph
 from ocp.query import Query
-from ocp.shortest_path import MoveGraph
 from ocp.trajectory import SolveError, Status
 
 COARSE = (58, 58, 35)

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.batch import optimal_inputs, state_costs
+from ocp.compiled.batch import optimal_inputs, state_costs
 from ocp.query import Query
 
 

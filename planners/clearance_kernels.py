@@ -12,7 +12,7 @@ settles an edge, in the order of cost:
 import numpy as np
 from numba import float64, types
 
-from ocp.jit import MATRIX, VECTOR, compiled
+from ocp.compiled.jit import MATRIX, VECTOR, compiled
 
 INDEX = types.Array(types.int64, 1, "C")
 EDGES = types.Array(types.int64, 2, "C")

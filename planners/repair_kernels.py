@@ -13,7 +13,7 @@ edge changes is followed by one cascade. With epsilon = 0 the fixed point is Dij
 import numpy as np
 from numba import boolean, float64, int64, types
 
-from ocp.jit import VECTOR, compiled
+from ocp.compiled.jit import VECTOR, compiled
 
 INDEX = types.Array(types.int64, 1, "C")
 EDGES = types.Array(types.int64, 2, "C")

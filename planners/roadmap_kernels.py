@@ -7,7 +7,7 @@ and is made when the newer is inserted; edges are listed by their newer end.
 import numpy as np
 from numba import boolean, float64, int64, types
 
-from ocp.jit import MATRIX, VECTOR, compiled
+from ocp.compiled.jit import MATRIX, VECTOR, compiled
 
 INDEX = types.Array(types.int64, 1, "C")
 EDGES = types.Array(types.int64, 2, "C")

@@ -12,7 +12,7 @@ import numpy as np
 from numba import int64, types
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled, float64
+from ocp.compiled.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled, float64
 from ocp.kernels import kernels, parameters
 from ocp.query import Query
 from ocp.trajectory import Status, Trajectory
@@ -301,7 +301,7 @@ def _first_hit(query: Query, times: NDArray, rows: NDArray, u: NDArray) -> tuple
     from scipy.interpolate import CubicHermiteSpline
     from scipy.optimize import brentq
 
-    from ocp.batch import rates, running_costs
+    from ocp.compiled.batch import rates, running_costs
 
     held = np.broadcast_to(u, (2, len(u)))
     slopes = np.column_stack(

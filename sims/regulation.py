@@ -15,7 +15,7 @@ from numba import float64, int64, types
 from numpy.typing import ArrayLike, NDArray
 
 from learning.quadratic_cost import QuadraticCost
-from ocp.jit import MATRIX, VECTOR, compiled
+from ocp.compiled.jit import MATRIX, VECTOR, compiled
 
 Array = NDArray[np.float64]
 

@@ -11,11 +11,11 @@ from rich.table import Table
 from ocp.closed_form import straight_value
 from ocp.collocation import solve_collocation
 from ocp.eikonal import solve_eikonal
-from ocp.extremal import find_extremal
+from ocp.extremals.extremal import find_extremal
+from ocp.extremals.warm_start import rollouts
 from ocp.oracle import Verdict, consult
 from ocp.pontryagin import exact_trajectory, solve_pmp
 from ocp.query_family import PAPER_FAMILY, PAPER_GOALS, PAPER_START, paper_query
-from ocp.warm_start import rollouts
 from sims.benchmarks import Report
 
 PROBLEMS = 100

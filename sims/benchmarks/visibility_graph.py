@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from ocp.jit import MATRIX, compiled
+from ocp.compiled.jit import MATRIX, compiled
 from planners.solids import Solid
 
 INDEX = types.Array(types.int64, 1, "C")

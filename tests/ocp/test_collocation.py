@@ -8,21 +8,21 @@ import pytest
 from references import ALL_QUERIES, TABLE_ONE_OPTIMA, aligned_value, typical_query
 from scipy.integrate import solve_ivp
 
-from ocp.batch import minimised_hamiltonians, optimal_inputs
 from ocp.collocation import solve_collocation
-from ocp.collocation_check import judge
+from ocp.compiled.batch import minimised_hamiltonians, optimal_inputs
 from ocp.cost import RunningCost
-from ocp.guess import default_guesses
+from ocp.extremals.guess import default_guesses
 from ocp.kernels import parameters
 from ocp.models import get_model
 from ocp.obstacle import Obstacle
 from ocp.query import Goal, Query
 from ocp.query_family import paper_query
-from ocp.radau import radau
 from ocp.riccati import LinearQuadratic, differential_riccati
 from ocp.trajectory import SolveError, Status
-from ocp.transcription import Problem, program
-from ocp.transcription_terms import Structure, state_cost
+from ocp.transcription.check import judge
+from ocp.transcription.programme import Problem, program
+from ocp.transcription.radau import radau
+from ocp.transcription.terms import Structure, state_cost
 
 START = np.array([-4.0, -4.0, -np.pi / 4])
 TERMINAL = 0.7 * np.eye(2) + 0.1

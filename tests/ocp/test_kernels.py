@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 from references import ALL_QUERIES, typical_query
 
-from ocp.batch import optimal_inputs, rates, running_costs, state_costs
+from ocp.compiled.batch import optimal_inputs, rates, running_costs, state_costs
 from ocp.kernels import kernels, parameters
 from ocp.query import Query
 

@@ -9,16 +9,16 @@ from references import TABLE_ONE_OPTIMA, aligned_value, typical_query
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-from ocp.batch import minimised_hamiltonians
 from ocp.collocation import solve_collocation
+from ocp.compiled.batch import minimised_hamiltonians
 from ocp.cost import RunningCost
-from ocp.extremal import find_extremal
+from ocp.extremals.extremal import find_extremal
+from ocp.extremals.transversality import GOAL_AT_REST, GOAL_PUSHED, goal_condition
 from ocp.obstacle import Obstacle
 from ocp.pontryagin import ExactValue, exact_trajectories, exact_trajectory, solve_pmp
 from ocp.query import Goal, Query
 from ocp.query_family import PAPER_FAMILY, PAPER_START, paper_query
 from ocp.trajectory import SolveError, Status, Trajectory
-from ocp.transversality import GOAL_AT_REST, GOAL_PUSHED, goal_condition
 from ocp.value import greedy
 
 FREE = Query("unicycle", Goal((1.0, 1.0), 0.5))
@@ -127,8 +127,8 @@ def test_random_problems_of_the_papers_family_agree_with_collocation() -> None:
 
 def test_one_shooting_from_a_rollout_succeeds_nearly_always() -> None:
     """The candidates' first guess, the closed loop of a coarse value: 39 of 40 at least."""
-    from ocp.candidates import coarse_value
-    from ocp.warm_start import policy_of, rollouts
+    from ocp.extremals.candidates import coarse_value
+    from ocp.extremals.warm_start import policy_of, rollouts
 
     rng, solved = np.random.default_rng(2), 0
     for _ in range(40):
@@ -283,7 +283,7 @@ def test_warm_start_from_a_neighbour_and_from_a_value() -> None:
     near = start + np.array([0.1, -0.1, 0.05])
     exact = exact_trajectory(CIRCLE, near).cost
     assert solve_pmp(CIRCLE, near, motion).cost == pytest.approx(exact, rel=1e-7)
-    from ocp.candidates import coarse_value
+    from ocp.extremals.candidates import coarse_value
 
     value = coarse_value(CIRCLE)
     assert value is not None

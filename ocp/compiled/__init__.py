@@ -1,0 +1,1 @@
+"""From a CasADi graph to compiled, cached numba functions."""

@@ -1,0 +1,1 @@
+"""Pontryagin's extremals: their flow, their ends, and how one is found."""

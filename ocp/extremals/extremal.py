@@ -1,0 +1,239 @@
+"""One extremal from a guess: multiple shooting, then every claim checked again.
+
+Pontryagin: along an optimal motion z = [x, p] follows the flow of the minimised Hamiltonian, ends
+on the terminal manifold (transversality.py), and H = 0 if the final time is free.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ocp.compiled.batch import optimal_inputs, rates, running_costs
+from ocp.extremals.hamiltonian_flow import flow_layout
+from ocp.extremals.shooting import (
+    BROKEN,
+    CONVERGED,
+    DAMPED_OUT,
+    SINGULAR,
+    shoot,
+    shooting_addresses,
+    trace,
+)
+from ocp.extremals.transversality import NEGLIGIBLE, Condition, goal_condition
+from ocp.extremals.warm_start import until_goal, with_costates
+from ocp.kernels import parameters
+from ocp.query import Query
+from ocp.trajectory import Status, Trajectory
+
+Array = NDArray[np.float64]
+
+SEGMENTS = 24
+REFINEMENTS = 2  # how often segments are halved where a converged answer is not accurate enough
+SAMPLES = 8  # points of the answer in each segment
+NEWTON_TOLERANCE = 1e-7  # the last correction, relative; the answer's error is its square
+STEP_TOLERANCE = 1e-8  # of the integration, relative
+CHECK_TOLERANCE = 1e-11  # of the second integration
+MAX_GAP = 1e-5  # between both integrations, over one segment and its growth of errors
+MAX_HAMILTONIAN = 1e-6  # |H| allowed where it should be 0, relative to the largest W
+MAX_DEPTH = 1e-9  # inside the goal before the end, relative to its radius
+LEAST_DAMPING = 1e-3
+
+WHY = {
+    DAMPED_OUT: "the Newton iteration stalled",
+    SINGULAR: "the linearised problem is singular",
+    BROKEN: "an iterate could not be integrated",
+}
+
+
+@dataclass(frozen=True)
+class Extremal:
+    """How a solve ended, and what it found.
+
+    Attributes:
+        status: SOLVED only if every check passed.
+        detail: why not, or empty.
+        iterations: of Newton's method.
+        seconds: spent in them.
+        trajectory: with costates; `None` unless solved.
+        hessian: `[n, n]`, second derivatives of V at the start; `None` unless solved.
+        bounds_active: whether the input touches a bound somewhere. The flow is then only once
+            differentiable there, and the extremal as valid.
+    """
+
+    status: Status
+    detail: str = ""
+    iterations: int = 0
+    seconds: float = 0.0
+    trajectory: Trajectory | None = None
+    hessian: Array | None = None
+    bounds_active: bool = False
+
+    @property
+    def cost(self) -> float:
+        """Cost of the motion; infinite unless solved."""
+        return np.inf if self.trajectory is None else self.trajectory.cost
+
+
+def find_extremal(
+    query: Query,
+    start: Array,
+    guess: Trajectory,
+    condition: Condition | None = None,
+    *,
+    segments: int = SEGMENTS,
+    tolerance: float = NEWTON_TOLERANCE,
+    step_tolerance: float = STEP_TOLERANCE,
+    max_iterations: int = 40,
+) -> Extremal:
+    """The extremal near `guess`; never raises for want of convergence.
+
+    Args:
+        query: the query.
+        start: `[n]`; not checked.
+        guess: a motion from near `start` to near the goal (or lasting the fixed time).
+        condition: the end's; by default the goal's.
+        segments: of multiple shooting.
+        tolerance: of the last Newton correction, relative to 1 + size.
+        step_tolerance: of the integration, likewise.
+        max_iterations: of Newton's method.
+    """
+    condition = condition or goal_condition(query)
+    start = np.ascontiguousarray(start, dtype=float)
+    if condition.at_goal:
+        guess = until_goal(query, guess)
+    guess = with_costates(query, guess)
+    settings = np.array([tolerance, step_tolerance, max_iterations, LEAST_DAMPING])
+    shot = _shoot(query, condition, start, guess, segments, settings)
+    iterations, seconds = shot.iterations, shot.seconds
+    for _ in range(REFINEMENTS):
+        if shot.motion is None or not shot.detail:
+            break
+        segments *= 2
+        shot = _shoot(query, condition, start, shot.motion, segments, settings)
+        iterations, seconds = iterations + shot.iterations, seconds + shot.seconds
+    if shot.motion is None or shot.detail:
+        return Extremal(Status.NOT_CONVERGED, shot.detail, iterations, seconds)
+    status, detail = _verdict(query, condition, shot.motion, shot.basis)
+    if status is not Status.SOLVED:
+        return Extremal(status, detail, iterations, seconds)
+    lower, upper = query.input_bounds
+    active = bool(((shot.motion.inputs <= lower) | (shot.motion.inputs >= upper)).any())
+    n = query.system.n
+    hessian = np.linalg.solve(shot.basis[0, :n].T, shot.basis[0, n:-1].T).T
+    return Extremal(status, "", iterations, seconds, shot.motion, (hessian + hessian.T) / 2, active)
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """A Newton solve: `motion` if it converged; `detail` says what is wrong, if anything is."""
+
+    iterations: int
+    seconds: float
+    detail: str
+    motion: Trajectory | None
+    basis: Array
+
+
+def _shoot(
+    query: Query,
+    condition: Condition,
+    start: Array,
+    guess: Trajectory,
+    segments: int,
+    settings: Array,
+) -> _Shot:
+    n = query.system.n
+    fractions, nodes = _nodes(guess, segments)
+    end = guess.states[-1].copy()
+    basis = np.zeros((segments + 1, 2 * n + 1, n))
+    functions, q, layout = shooting_addresses(query), parameters(query), flow_layout(query)
+    # Near the goal costates and costs are small themselves.
+    small = float(np.clip(guess.cost, 1e-5, 1.0)) if condition.at_goal else 1.0
+    settings = settings * [small, small, 1.0, 1.0]
+    begun = time.perf_counter()
+    ended, iterations, duration, _ = shoot(
+        condition.kind, condition.at_goal, functions, q, layout, condition.terms, settings,
+        start, fractions, nodes, end, guess.duration, basis,
+    )  # fmt: skip
+    seconds = time.perf_counter() - begun
+    if ended != CONVERGED:
+        detail = WHY.get(ended, f"no convergence in {iterations} iterations")
+        return _Shot(iterations, seconds, detail, None, basis)
+    nodes[0, :n] = start
+    points = np.empty((segments * SAMPLES + 1, 2 * n + 1))
+    gap = trace(
+        functions, q, layout, fractions, nodes, duration, SAMPLES, small * CHECK_TOLERANCE, points
+    )
+    if not gap < np.inf:
+        return _Shot(iterations, seconds, "the answer could not be integrated again", None, basis)
+    marks = np.arange(segments * SAMPLES + 1) / SAMPLES
+    motion = Trajectory(
+        duration * np.interp(marks, np.arange(segments + 1), fractions),
+        points[:, :n].copy(),
+        optimal_inputs(query, points[:, :n], points[:, n:-1]),
+        points[:, n:-1].copy(),
+        points[:, -1].copy(),
+    )
+    detail = ""
+    off, allowed = _hamiltonian_error(query, condition, motion)
+    if not gap <= MAX_GAP:
+        detail = f"integrated again, nodes are missed by {gap:.1e}"
+    elif not off <= allowed:
+        detail = f"the Hamiltonian is off by {off:.1e}"
+    return _Shot(iterations, seconds, detail, motion, basis)
+
+
+def _nodes(guess: Trajectory, segments: int) -> tuple[Array, Array]:
+    """Fractions of the duration `[N + 1]` and z there `[N + 1, 2n]`.
+
+    Segments share out time, and the change of z along the guess, equally.
+    """
+    assert guess.costates is not None
+    z = np.hstack([guess.states, guess.costates])
+    moved = np.abs(np.diff(z, axis=0)).sum(axis=1)
+    share = moved / max(moved.sum(), 1e-300) + np.diff(guess.times) / guess.duration
+    mesh = np.concatenate([[0.0], np.cumsum(share)])
+    fractions = np.interp(
+        np.linspace(0, mesh[-1], segments + 1), mesh, guess.times / guess.duration
+    )
+    fractions[0], fractions[-1] = 0.0, 1.0
+    at = fractions * guess.duration
+    return fractions, np.column_stack([np.interp(at, guess.times, c) for c in z.T])
+
+
+def _hamiltonian_error(
+    query: Query, condition: Condition, motion: Trajectory
+) -> tuple[float, float]:
+    """By how much H is off along a motion (0 at the goal, else constant), and the error allowed.
+
+    H is made from the definitions of dynamics and running cost, which the flow was derived from.
+    """
+    x, u, p = motion.states, motion.inputs, motion.costates
+    assert p is not None
+    costs = running_costs(query, x, u)
+    hamiltonian = costs + (p * rates(query, x, u)).sum(axis=-1)
+    constant = 0.0 if condition.at_goal else hamiltonian[0]
+    size = costs.max() + np.abs(hamiltonian - costs).max()
+    return float(np.abs(hamiltonian - constant).max()), MAX_HAMILTONIAN * size + NEGLIGIBLE
+
+
+def _verdict(
+    query: Query, condition: Condition, motion: Trajectory, basis: Array
+) -> tuple[Status, str]:
+    """Whether the extremal is what was asked for, and a local minimum."""
+    x = motion.states
+    depth = -query.goal_distance(x[:-1]).min()
+    if condition.at_goal and depth > MAX_DEPTH * query.goal.radius:
+        return Status.WRONG_EXTREMAL, "it crosses the goal before it ends"
+    n = query.system.n
+    signs = np.sign(np.linalg.det(basis[:-1, :n]))
+    if (signs != signs[0]).any():
+        return Status.WRONG_EXTREMAL, "it has a conjugate point, so it is no local minimum"
+    if query.hard_obstacles:
+        clearance = query.clearance(x, hard_only=True)
+        steps = np.linalg.norm(np.diff(query.position(x), axis=0), axis=1)
+        if not (np.minimum(clearance[1:], clearance[:-1]) > steps / 2).all():
+            return Status.NOT_APPLICABLE, "it touches a hard obstacle, or nearly"
+    return Status.SOLVED, ""

@@ -1,0 +1,212 @@
+"""First guesses for extremals: motions completed with costates, rollouts of policies, continuation.
+
+A guess is a `Trajectory` that need satisfy nothing exactly. One without costates gets them from the
+adjoint equation p' = -dH/dx along it, backward from p = 0.
+"""
+
+from dataclasses import replace
+from functools import cache, lru_cache
+
+import casadi as ca
+import numpy as np
+from numba import types
+from numpy.typing import ArrayLike, NDArray
+
+from ocp.compiled.batch import running_costs, state_costs
+from ocp.compiled.function_address import ADDRESSES, addresses, function_at
+from ocp.compiled.jit import KERNEL, KERNEL_WITH_JACOBIAN, MATRIX, VECTOR, compiled
+from ocp.kernels import Kernels, kernels, parameters
+from ocp.query import Query
+from ocp.system import System
+from ocp.trajectory import Status, Trajectory
+from ocp.value import GreedyPolicy, Policy, Value
+
+Array = NDArray[np.float64]
+
+STRIDE = 0.015  # of the domain's extent: length of a rollout's step where time is free
+PERIOD = 0.05  # seconds: a rollout's step otherwise
+MAX_STEPS = 800
+
+kernel_at = function_at(KERNEL)
+
+
+def with_costates(query: Query, guess: Trajectory) -> Trajectory:
+    """`guess`, with costates from the adjoint equation if it has none."""
+    if guess.costates is not None:
+        return guess
+    middles = (guess.states[1:] + guess.states[:-1]) / 2
+    # Inputs of a guess may jump: the later node's belong to the interval (see `guess.py`).
+    jacobians = _state_jacobians(query.system, middles, guess.inputs[1:])
+    slopes = np.empty_like(middles)
+    _cost_gradients(kernels(query).state_cost_derivatives, middles, parameters(query), slopes)
+    # The implicit midpoint rule, which stays bounded on long intervals.
+    lengths = np.diff(guess.times)[:, None]
+    pull = lengths[..., None] / 2 * jacobians.transpose(0, 2, 1)
+    identity = np.eye(query.system.n)
+    right = np.concatenate([identity + pull, (lengths * slopes)[..., None]], axis=2)
+    steps = np.linalg.solve(identity - pull, right)
+    costates = np.zeros_like(guess.states)
+    for k in range(len(middles) - 1, -1, -1):
+        costates[k] = steps[k, :, :-1] @ costates[k + 1] + steps[k, :, -1]
+    return replace(guess, costates=costates)
+
+
+def until_goal(query: Query, guess: Trajectory) -> Trajectory:
+    """`guess` up to its first hit of the goal ball; all of it if there is none."""
+    distance = query.goal_distance(guess.states)
+    inside = np.flatnonzero(distance <= 0)
+    if len(inside) == 0 or inside[0] == 0:
+        return guess
+    k = int(inside[0])
+    part = distance[k - 1] / (distance[k - 1] - distance[k])
+    times = np.append(guess.times[:k], guess.times[k - 1] + part * np.diff(guess.times)[k - 1])
+    return resampled(guess, times)
+
+
+def onward(guess: Trajectory, time: float) -> Trajectory:
+    """The rest of a motion from `time` on: the guess for a start further along it."""
+    times = np.concatenate([[time], guess.times[guess.times > time]])
+    rest = resampled(guess, times)
+    return replace(
+        rest, times=rest.times - time, cost_so_far=rest.cost_so_far - rest.cost_so_far[0]
+    )
+
+
+def resampled(guess: Trajectory, times: Array) -> Trajectory:
+    """A motion at other times, linear in between."""
+
+    def at(columns: Array) -> Array:
+        return np.column_stack([np.interp(times, guess.times, c) for c in columns.T])
+
+    costates = None if guess.costates is None else at(guess.costates)
+    cost = np.interp(times, guess.times, guess.cost_so_far)
+    return Trajectory(times, at(guess.states), at(guess.inputs), costates, cost, guess.status)
+
+
+def policy_of(query: Query, source: Value | Policy) -> Policy:
+    """A policy as it is; a value's lookahead policy on a grid, else its greedy one."""
+    from ocp.grid import GridValue
+    from ocp.grids.lookahead import LookaheadPolicy
+
+    if callable(source):
+        return source  # pyright: ignore[reportReturnType]
+    if isinstance(source, GridValue):
+        return LookaheadPolicy(query, source)
+    return GreedyPolicy(query, source)
+
+
+def rollouts(query: Query, policy: Policy, starts: ArrayLike) -> list[Trajectory | None]:
+    """Rough closed-loop motions from states `[k, n]`; `None` where one does not get to the goal.
+
+    Where time is free they are steps of constant length, at the best speed; else of constant time.
+    """
+    system = query.system
+    states = np.array(np.atleast_2d(np.asarray(starts, dtype=float)))
+    stride = STRIDE * (system.upper - system.lower)[list(system.position)].max()
+    path, moves = [states], []
+    distances = [query.goal_distance(states)]
+    for _ in range(MAX_STEPS):
+        inputs = policy(states)
+        if query.is_time_free:
+            effort = np.sqrt((query.input_weights * inputs**2).sum(axis=-1))
+            durations = stride / np.maximum(effort, 1e-12)
+        else:
+            durations = np.full(len(states), PERIOD)
+        states = advanced(query, states, inputs, durations)
+        path.append(states)
+        moves.append((durations, inputs))
+        distances.append(query.goal_distance(states))
+        if (np.min(distances, axis=0) <= 0).all():
+            break
+    found: list[Trajectory | None] = []
+    for row in range(states.shape[0]):
+        signed = np.array([d[row] for d in distances])
+        inside = np.flatnonzero(signed <= 0)
+        if len(inside) == 0 or inside[0] == 0:
+            found.append(None)
+            continue
+        count = int(inside[0])
+        motion = np.array([p[row] for p in path[: count + 1]])
+        durations = np.array([m[0][row] for m in moves[:count]])
+        inputs = np.array([m[1][row] for m in moves[:count]])
+        part = signed[count - 1] / (signed[count - 1] - signed[count])
+        motion[count] = motion[count - 1] + part * (motion[count] - motion[count - 1])
+        durations[count - 1] *= part
+        found.append(timed(query, motion, durations, inputs))
+    return found
+
+
+def timed(query: Query, states: Array, durations: Array, inputs: Array) -> Trajectory:
+    """A guess from states `[k + 1, n]` and the durations `[k]` and inputs `[k, m]` between them.
+
+    Without drift, durations and inputs are rescaled to the best speed (the mean of both ends'), or
+    what the bounds allow.
+    """
+    middles = (states[1:] + states[:-1]) / 2
+    if not query.system.has_drift:
+        effort = (query.input_weights * inputs**2).sum(axis=-1)
+        best = np.sqrt(state_costs(query, states))
+        best = np.maximum((best[1:] + best[:-1]) / 2, 1e-9)
+        faster = best / np.sqrt(np.maximum(effort, 1e-300))
+        lower, upper = query.input_bounds
+        room = np.where(inputs > 0, upper, lower)
+        allowed = np.abs(room) / np.maximum(np.abs(inputs), 1e-300)
+        faster = np.maximum(np.minimum(faster, allowed.min(axis=-1)), 1e-6)
+        inputs, durations = inputs * faster[:, None], durations / faster
+    costs = np.cumsum(durations * running_costs(query, middles, inputs))
+    return Trajectory(
+        np.concatenate([[0.0], np.cumsum(durations)]),
+        states,
+        np.concatenate([inputs[:1], inputs]),
+        None,
+        np.concatenate([[0.0], costs]),
+        Status.NOT_CONVERGED,
+    )
+
+
+def advanced(query: Query, states: Array, inputs: Array, durations: Array) -> Array:
+    """States `[k, n]` after one midpoint step under inputs `[k, m]` held for durations `[k]`."""
+    out = np.empty_like(states)
+    _midpoint(_dynamics_address(kernels(query)), states, inputs, durations, out)
+    return out
+
+
+@cache
+def _dynamics_address(compiled_query: Kernels) -> NDArray[np.intp]:
+    return addresses([compiled_query.dynamics])
+
+
+@compiled(types.void(ADDRESSES, MATRIX, MATRIX, VECTOR, MATRIX))
+def _midpoint(functions, states, inputs, durations, out):
+    dynamics = kernel_at(functions[0, 0], functions[0, 1])
+    n = states.shape[1]
+    rate, half = np.empty(n), np.empty(n)
+    for row in range(states.shape[0]):
+        x, u, h = states[row], inputs[row], durations[row]
+        dynamics(x, u, rate)
+        for i in range(n):
+            half[i] = x[i] + h / 2 * rate[i]
+        dynamics(half, u, rate)
+        for i in range(n):
+            out[row, i] = x[i] + h * rate[i]
+
+
+@lru_cache
+def _state_jacobian(system: System) -> ca.Function:
+    u = ca.SX.sym("u", system.m)  # pyright: ignore[reportArgumentType]
+    rate = system.drift + system.input_matrix @ u
+    return ca.Function("A", [system.state, u], [ca.densify(ca.jacobian(rate, system.state).T)])
+
+
+def _state_jacobians(system: System, states: Array, inputs: Array) -> Array:
+    """d(f + G u)/dx `[k, n, n]` at states `[k, n]` and inputs `[k, m]`."""
+    stacked = np.array(_state_jacobian(system).map(len(states))(states.T, inputs.T))
+    return stacked.reshape(system.n, len(states), system.n).transpose(1, 2, 0)
+
+
+@compiled(types.void(KERNEL_WITH_JACOBIAN, MATRIX, VECTOR, MATRIX))
+def _cost_gradients(derivatives, states, q, out):
+    n = states.shape[1]
+    hessian = np.empty((n, n))
+    for i in range(states.shape[0]):
+        derivatives(states[i], q, out[i], hessian)

@@ -1,0 +1,1 @@
+"""Schemes that solve the Hamilton-Jacobi equation on a grid."""
