@@ -12,6 +12,9 @@ from sims.exit_status import reading_input
 if TYPE_CHECKING:
     from sims import cli
 
+WIDTH = 118
+"""Columns a table may fill at least: cut headings tell nobody what was measured."""
+
 
 def run(command: "cli.Bench") -> int:
     """Run the command; returns its exit status."""
@@ -25,7 +28,8 @@ def run(command: "cli.Bench") -> int:
         report = run_benchmark(name, command.seed, command.out)
         document["benchmarks"][name] = report.figures
         for table in report.tables:
-            Console(stderr=command.json).print(table)
+            console = Console(stderr=command.json)
+            console.print(table, width=max(console.width, WIDTH))
     if command.json:
         print(json.dumps(document))
     if command.out is not None:
