@@ -67,7 +67,7 @@ class Demo(Common):
     """Run a scripted demo, one for each capability."""
 
     name: tyro.conf.Positional[str] = tyro.MISSING
-    """four-queries: the four queries of Xu and Zhu's Table I."""
+    """four-queries: the four queries of Xu and Zhu's Table I; replanning: RRT^X at work."""
 
     def run(self) -> int:
         from sims.demos import run

@@ -27,13 +27,13 @@ class PlannerReplay:
         Raises:
             ValueError: if the planner's world is no scene of the plane.
         """
-        from pydrake.geometry import Meshcat, MeshcatAnimation, Rgba
+        from pydrake.geometry import Meshcat, MeshcatAnimation, MeshcatParams, Rgba
 
         world = planner.world
         if not isinstance(world, SceneWorld) or world.dimension != 2:
             raise ValueError("replay: the planner does not plan in the plane")
         self._planner, self._world = planner, world
-        self._meshcat: Any = Meshcat()
+        self._meshcat: Any = Meshcat(MeshcatParams(host="localhost"))
         self._animation: Any = MeshcatAnimation(20.0)
         self._rgba = Rgba
         self._shown: dict[str, int] = {}

@@ -1,21 +1,14 @@
-"""Scripted demos, one a capability; each leaves a figure."""
+"""The paper's four queries, the exact optimum and the paper's figures beside."""
 
-import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
-from ocp.files import write_text
 from ocp.query_family import PAPER_FIGURE_STARTS, PAPER_GOALS, PAPER_START, paper_query
-from sims.exit_status import UNSOLVED, reading_input
+from sims.demos import Demonstration
 from sims.plan import Outcome, number, solve
-
-if TYPE_CHECKING:
-    from sims import cli
 
 PAPER_CLAIMS = {
     (4.0, 4.0): (24.0, 24.9),
@@ -26,11 +19,8 @@ PAPER_CLAIMS = {
 """Xu and Zhu, Table I: the benchmark (set-valued, fine grid) and anytime adaptation."""
 
 
-def four_queries(out: Path | None) -> tuple[dict[str, Any], Table, bool]:
-    """The paper's four queries from its seven starts, eikonal method, against the exact optimum.
-
-    Returns the JSON document, a table, and whether every loop reached its goal.
-    """
+def run(_seed: int, out: Path | None) -> Demonstration:
+    """The paper's four queries from its seven starts, eikonal method, against the exact optimum."""
     starts = [np.array(s) for s in (PAPER_START, *PAPER_FIGURE_STARTS)]
     entries, panels = [], []
     for goal in PAPER_GOALS:
@@ -69,7 +59,7 @@ def four_queries(out: Path | None) -> tuple[dict[str, Any], Table, bool]:
     if out is not None:
         _four_panels(panels, out)
     reached = all(s["reached"] for e in entries for s in e["starts"])
-    return {"demo": "four-queries", "queries": entries}, table, reached
+    return Demonstration({"queries": entries}, [table], reached)
 
 
 def _entry(goal: tuple[float, float], reaction: float, outcomes: list[Outcome]) -> dict[str, Any]:
@@ -94,25 +84,3 @@ def _four_panels(panels: list, out: Path) -> None:
     legend(figure)
     for suffix in (".png", ".svg"):
         save(figure, out / f"four-queries{suffix}")
-
-
-DEMOS: dict[str, Callable[[Path | None], tuple[dict[str, Any], Table, bool]]] = {
-    "four-queries": four_queries,
-}
-
-
-def run(command: "cli.Demo") -> int:
-    """Run the command; returns its exit status."""
-    with reading_input():
-        if command.name not in DEMOS:
-            raise ValueError(f"demo: {command.name!r} is unknown; known are {', '.join(DEMOS)}")
-    document, table, reached = DEMOS[command.name](command.out)
-    if command.json:
-        print(json.dumps(document))
-    else:
-        Console().print(table)
-        if command.out is not None:
-            Console(stderr=True).print(f"pictures and data: {command.out}")
-    if command.out is not None:
-        write_text(command.out / f"{command.name}.json", json.dumps(document, indent=1) + "\n")
-    return 0 if reached else UNSOLVED
