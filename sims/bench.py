@@ -28,8 +28,8 @@ def run(command: "cli.Bench") -> int:
         report = run_benchmark(name, command.seed, command.out)
         document["benchmarks"][name] = report.figures
         for table in report.tables:
-            console = Console(stderr=command.json)
-            console.print(table, width=max(console.width, WIDTH))
+            width = max(Console().width, WIDTH)
+            Console(stderr=command.json, width=width).print(table)
     if command.json:
         print(json.dumps(document))
     if command.out is not None:

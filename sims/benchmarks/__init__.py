@@ -16,6 +16,8 @@ from rich.table import Table
 BENCHMARKS: dict[str, str] = {
     "exact": "exact costs, closed form, success and time of exact trajectories",
     "grids": "eikonal and set-valued grids: time, value error, closed-loop excess",
+    "lqr": "analytic LQR: Riccati, matrix exponential, collocation and PMP",
+    "orders": "orders of convergence of the grid schemes, on and off the axis",
     "rrtx": "RRT^X: repair after changes, against growth from scratch, OMPL and the optimum",
 }
 """Name of the module in this folder, and what it measures."""
