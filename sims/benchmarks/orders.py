@@ -152,16 +152,27 @@ def _figure(rows: list[dict[str, Any]], out: Path) -> None:
     from sims.figures import save
 
     names = list(dict.fromkeys(row["case"] for row in rows))
-    figure, axes = plt.subplots(len(names), 2, figsize=(9.6, 9.6), layout="constrained")
+    spacings = 10 / np.array(CELLS)
+    figure, axes = plt.subplots(len(names), 2, figsize=(9.6, 10.2), layout="constrained")
     for name, (left, right) in zip(names, axes, strict=True):
+        ends: list[tuple[float, str, Any]] = []
         for row, marker in zip([r for r in rows if r["case"] == name], "os^D", strict=True):
             percent = 100 * np.array(row["median_errors"])
-            label = f"{row['scheme']}: order {row['order']:.2f}"
-            left.loglog(10 / np.array(CELLS), percent, marker=marker, label=label)
+            (line,) = left.loglog(spacings, percent, marker=marker, label=row["scheme"])
             right.loglog(1e3 * np.array(row["seconds"]), percent, marker=marker)
-        left.set(title=name, xlabel="spacing (m)", ylabel="median value error (%)")
+            ends.append((percent[-1], f"{row['order']:.2f}", line.get_color()))
+        height = 0.0
+        for error, order, colour in sorted(ends):
+            height = max(error, 1.6 * height)  # so that no two overlap
+            left.text(0.9 * spacings[-1], height, order, ha="right", va="center", color=colour)
+        left.set(title=f"{name}; orders", xlabel="spacing (m)")
+        left.set_ylabel("median value error (%)")
+        left.set_xlim(spacings[-1] / 1.5, spacings[0] * 1.15)
+        left.set_xticks(spacings, [f"{s:g}" for s in spacings])
+        left.minorticks_off()
         right.set(xlabel="time to solve (ms, one thread)")
-        left.legend(frameon=False, fontsize=7)
         for panel in (left, right):
             panel.grid(which="both", alpha=0.25)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     save(figure, out / "orders.png")
