@@ -23,8 +23,12 @@ class SolveError(RuntimeError):
     """A solve that did not succeed; `status` says how it ended."""
 
     def __init__(self, status: Status, detail: str = "") -> None:
-        self.status = status
+        self.status, self.detail = status, detail
         super().__init__(f"{status.value}{': ' + detail if detail else ''}")
+
+    def __reduce__(self) -> tuple[type["SolveError"], tuple[Status, str]]:
+        """Made again from what it was made of, so that it travels between processes."""
+        return SolveError, (self.status, self.detail)
 
 
 @dataclass(frozen=True)

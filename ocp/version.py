@@ -1,0 +1,54 @@
+"""Which code made a number: a digest of the sources that can have changed it."""
+
+import ast
+import hashlib
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent
+
+
+@cache
+def code_version(module: str | None = None) -> str:
+    """Digest of `module` (such as "ocp.eikonal") and of every module of `ocp` that it may import.
+
+    Imports inside functions count; libraries do not. Without a module, of all of `ocp`.
+
+    Raises:
+        ValueError: if there is no such module.
+    """
+    if module is None:
+        files = sorted(ROOT.rglob("*.py"))
+    else:
+        if (first := _file(module)) is None:
+            raise ValueError(f"module: {module!r} is no module of ocp")
+        found, waiting = {first}, [first]
+        while waiting:
+            new = {f for name in _imported(waiting.pop()) if (f := _file(name))} - found
+            found |= new
+            waiting += new
+        files = sorted(found)
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0")
+        digest.update(path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _file(name: str) -> Path | None:
+    """The source of a module of ocp, or `None` if the name is none."""
+    head, *rest = name.split(".")
+    if head != ROOT.name:
+        return None
+    base = ROOT.joinpath(*rest)
+    return next((p for p in (base.with_suffix(".py"), base / "__init__.py") if p.is_file()), None)
+
+
+def _imported(path: Path) -> set[str]:
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
