@@ -90,6 +90,11 @@ class GoalTable:
         return out.reshape(len(x), len(y), len(headings))
 
     @property
+    def numbers(self) -> Floats:
+        """What the look-up kernels are told beside the table."""
+        return self._numbers
+
+    @property
     def _numbers(self) -> Floats:
         # Constants of another module go in as numbers: numba's cache would not see them change.
         return np.array([*self.center, self.radius, self.unit, U_FIRST, U_STEP, SOFT])
@@ -365,6 +370,27 @@ def _gradients(table, states, numbers, out):
             out[row, 0] = V_d * px / r + sign * V_psi * py / r**2
             out[row, 1] = V_d * py / r - sign * V_psi * px / r**2
             out[row, 2] = sign * V_psi
+
+
+VALUE_AND_GRADIENT = types.FunctionType(types.void(MATRIX, VECTOR, VECTOR, VECTOR))
+
+
+@compiled(types.void(MATRIX, VECTOR, VECTOR, VECTOR))
+def value_and_gradient(table, numbers, state, out):
+    """V, then grad V, `[4]`, at one state `[3]`, for other kernels: nothing is checked.
+
+    `table` and `numbers` are those of a `GoalTable`; beyond its reach the value is extrapolated.
+    """
+    px, py = state[0] - numbers[0], state[1] - numbers[1]
+    r = math.hypot(px, py)
+    out[:] = 0.0
+    if r > numbers[2]:
+        psi, sign = _fold(state[2] - math.atan2(py, px))
+        V, V_d, V_psi = _lookup(table, r - numbers[2], psi, numbers)
+        out[0] = V
+        out[1] = V_d * px / r + sign * V_psi * py / r**2
+        out[2] = V_d * py / r - sign * V_psi * px / r**2
+        out[3] = sign * V_psi
 
 
 @compiled(types.void(MATRIX, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX))

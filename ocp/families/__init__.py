@@ -1,0 +1,1 @@
+"""Families of queries, frozen in TOML files."""
