@@ -258,7 +258,9 @@ def _update(
             cost[a] = _mean(c, g, a, slowness, cost_offset, cost_weight, own)
         if cost[b] < 0.0:
             cost[b] = _mean(c, g, b, slowness, cost_offset, cost_weight, own)
-        mean = 0.5 * (cost[a] + cost[b])
+        # With the mean of the two, raising one could lower the minimum by moving it inside, where
+        # the other's lower cost counts: the larger keeps the scheme monotone.
+        mean = max(cost[a], cost[b])
         rise = foot[b] - foot[a]
         if rise < -mean * pair_geometry[g, k, 0] and rise > -mean * pair_geometry[g, k, 1]:
             r = rise / (mean * pair_geometry[g, k, 2])
@@ -274,9 +276,8 @@ def _update(
         # minimum lies inside the face if the weights of the motions in p are positive.
         size, mean = 0, 0.0
         while size < faces.shape[1] and faces[k, size] >= 0:
-            mean += cost[faces[k, size]]
+            mean = max(mean, cost[faces[k, size]])
             size += 1
-        mean /= size
         ones, mixed, square = 0.0, 0.0, -mean * mean
         for i in range(size):
             for j in range(size):

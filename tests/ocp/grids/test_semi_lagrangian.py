@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from references import TABLE_ONE_OPTIMA, aligned_value
 
@@ -128,6 +128,7 @@ coordinate = st.floats(-4.5, 4.5)
 
 @settings(max_examples=15)
 @given(coordinate, coordinate, st.floats(0.2, 1.2), coordinate, coordinate)
+@example(0.5003650522865106, -2.0569355592290863, 0.879181533021365, 3.41686056, -3.92207006)
 def test_an_obstacle_never_lowers_the_value(x: float, y: float, r: float, gx: float, gy: float):
     free = replace(PLAIN, goal=Goal((gx, gy), 0.6))
     soft = replace(free, obstacles=(Obstacle.circle((x, y), r),))
