@@ -8,7 +8,7 @@ import logging
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -106,10 +106,44 @@ class Bench(Common):
         return run(self)
 
 
+@dataclass(frozen=True)
+class Store(Common):
+    """Look into a value store, check it, merge stores, export or fill one.
+
+    Example: zermelo store fill values --count 100 --workers 2; zermelo store verify values
+    """
+
+    action: tyro.conf.Positional[Literal["list", "verify", "merge", "export", "fill"]] = (
+        tyro.MISSING
+    )
+    """list entries; verify every hash; merge the other stores into the first; export query files
+    and arrays to --out; fill with what is missing of the answers to queries."""
+    store: tyro.conf.Positional[Path] = tyro.MISSING
+    """The store's folder."""
+    others: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """merge: stores to take entries from. fill: query files, instead of --count random ones."""
+    count: int = 100
+    """fill: queries to draw from the paper's family."""
+    solver: str = "eikonal"
+    """fill: eikonal (values on a grid) or exact (costs at random starts)."""
+    nodes: int | None = None
+    """fill: size of the grid."""
+    workers: int = 0
+    """fill: local worker processes; 0 works in this one."""
+    cluster: str | None = None
+    """fill: a Dask scheduler's address, such as tcp://127.0.0.1:8786, instead of --workers."""
+
+    def run(self) -> int:
+        from sims.store_command import run
+
+        return run(self)
+
+
 Command = (
     Annotated[Plan, tyro.conf.subcommand("plan")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Regulate, tyro.conf.subcommand("regulate")]
+    | Annotated[Store, tyro.conf.subcommand("store")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
