@@ -115,11 +115,17 @@ class Query:
 
     @property
     def input_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper input bounds, `[m]` each, infinite where there is none."""
-        m = self.system.m
-        lower = np.full(m, -np.inf) if self.input_lower is None else np.array(self.input_lower)
-        upper = np.full(m, np.inf) if self.input_upper is None else np.array(self.input_upper)
-        return lower.astype(float), upper.astype(float)
+        """Lower and upper input bounds, `[m]` each, infinite where there is none.
+
+        The query's own, within what the robot's actuators can do.
+        """
+        lower = np.array([i.lower for i in self.system.inputs], dtype=float)
+        upper = np.array([i.upper for i in self.system.inputs], dtype=float)
+        if self.input_lower is not None:
+            lower = np.maximum(lower, self.input_lower)
+        if self.input_upper is not None:
+            upper = np.minimum(upper, self.input_upper)
+        return lower, upper
 
     @property
     def is_bounded(self) -> bool:

@@ -41,10 +41,18 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Input:
-    """One control input with its unit."""
+    """One control input with its unit and what the actuator can do; by default anything."""
 
     name: str
     unit: str
+    lower: float = -np.inf
+    upper: float = np.inf
+
+    def __post_init__(self) -> None:
+        if not self.lower < self.upper:  # NaN fails too
+            raise ValueError(
+                f"input {self.name!r}: limits must be increasing, got [{self.lower}, {self.upper}]"
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,10 @@
 """A robot and a policy as Drake systems, for Diagrams and Drake's Simulator."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.systems.framework import Context, LeafSystem
 
 from ocp.kernels import kernels, parameters
@@ -58,3 +60,20 @@ class SampledPolicy(LeafSystem):
     def _sample(self, context: Context, discrete: Any) -> None:
         state: Any = self.get_input_port(0).Eval(context)
         discrete.get_mutable_vector().SetFromVector(np.asarray(self._policy(state)))
+
+
+class StateFeedback(LeafSystem):
+    """u = law(state), without memory or delay.
+
+    Ports: input "state" `[n]`; output "u" `[m]`.
+    """
+
+    def __init__(self, law: Callable[[NDArray[np.float64]], NDArray[np.float64]], n: int, m: int):
+        super().__init__()
+        self._law = law
+        self.DeclareVectorInputPort("state", n)
+        self.DeclareVectorOutputPort("u", m, self._output)
+
+    def _output(self, context: Context, output: Any) -> None:
+        state: Any = self.get_input_port(0).Eval(context)
+        output.SetFromVector(np.asarray(self._law(np.array(state))))
