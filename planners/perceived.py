@@ -1,0 +1,152 @@
+"""What a robot knows of the world: obstacles within its perception, and how they move."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planners.leg_clearance import Surroundings
+from planners.solids import Solid
+
+Array = NDArray[np.float64]
+
+STILL = 1e-3
+"""Metres a second; what moves more slowly is standing."""
+STEP = 0.1
+"""Metres an obstacle moves before the planner is told."""
+STEADY = 1.0
+"""Seconds without a change of velocity, after which an obstacle's motion counts as known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One obstacle as it is seen now.
+
+    Attributes:
+        key: the same whenever the same obstacle is seen.
+        solid: where it is now. Its whole shape is known as soon as some part of it is seen.
+    """
+
+    key: int
+    solid: Solid
+
+
+@dataclass(eq=False)
+class _Known:
+    handle: int
+    solid: Solid
+    planned: Array
+    seen: float
+    velocity: Array
+    unsteady: float = -np.inf
+
+
+@dataclass
+class Changes:
+    """What the planner has to be told.
+
+    Attributes:
+        add: solids that were not known, and their keys.
+        remove: handles of what is gone.
+        move: translations by handle.
+    """
+
+    add: list[tuple[int, Solid]] = field(default_factory=list)
+    remove: list[int] = field(default_factory=list)
+    move: dict[int, Array] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.add or self.remove or self.move)
+
+
+class Perceived:
+    """The obstacles that were seen: standing ones are remembered, moving ones only while seen.
+
+    A standing obstacle that is not where it was although it should be seen has vanished. An
+    obstacle's velocity is the difference of two sightings; at the first it is taken as standing.
+    """
+
+    def __init__(self, dimension: int, radius: float, growth: float) -> None:
+        """Perception up to `radius` metres.
+
+        Args:
+            dimension: d.
+            radius: of the perception, metres.
+            growth: metres a second by which a body is extended in forecasts while it changes its
+                velocity: what it will do is then not known.
+        """
+        self._radius, self._growth = radius, growth
+        self._known: dict[int, _Known] = {}
+        self.surroundings = Surroundings(dimension)
+
+    @property
+    def solids(self) -> list[Solid]:
+        """All that is known of, where it was seen last."""
+        return [known.solid for known in self._known.values()]
+
+    @property
+    def moving(self) -> bool:
+        """Whether something that is known of moves."""
+        return any(np.linalg.norm(known.velocity) > STILL for known in self._known.values())
+
+    def look(self, time: float, position: Array, sightings: Iterable[Sighting]) -> Changes:
+        """Take in what is seen at `time` (seconds) from `position` `[d]`."""
+        changes = Changes()
+        seen = set()
+        for sighting in sightings:
+            seen.add(sighting.key)
+            known = self._known.get(sighting.key)
+            if known is None:
+                changes.add.append((sighting.key, sighting.solid))
+                continue
+            if sighting.solid is not known.solid:
+                self._follow(known, sighting.solid, time)
+            elif known.velocity.any():
+                known.velocity = np.zeros_like(known.velocity)
+                known.unsteady = time
+            known.seen = time
+            shift = known.solid.center - known.planned
+            if np.linalg.norm(shift) > STEP:
+                changes.move[known.handle] = shift
+                known.planned = known.solid.center.copy()
+        for key, known in list(self._known.items()):
+            if key in seen:
+                continue
+            moving = np.linalg.norm(known.velocity) > STILL
+            if moving or self._should_be_seen(known.solid, position):
+                changes.remove.append(known.handle)
+                del self._known[key]
+        return changes
+
+    def remember(self, key: int, solid: Solid, handle: int, time: float) -> None:
+        """The planner knows a new obstacle by this handle."""
+        self._known[key] = _Known(
+            handle, solid, solid.center.copy(), time, np.zeros_like(solid.center)
+        )
+
+    def refresh(self, time: float) -> None:
+        """Bring `surroundings` up to date."""
+        every = list(self._known.values())
+        velocities = np.array([k.velocity for k in every])
+        growths = np.array([self._growth * (time - k.unsteady < STEADY) for k in every])
+        self.surroundings.update([k.solid for k in every], velocities, growths)
+
+    def clearance(self, position: Array) -> float:
+        """Metres from `position` `[d]` to the nearest obstacle known; `FAR` if there is none."""
+        return float(self.surroundings.clearances(position[None, None], 1.0, 1.0)[0])
+
+    def _follow(self, known: _Known, solid: Solid, time: float) -> None:
+        velocity = (solid.center - known.solid.center) / (time - known.seen)
+        if np.linalg.norm(velocity - known.velocity) > 0.02 and known.velocity.any():
+            known.unsteady = time
+        known.velocity, known.solid = velocity, solid
+
+    def _should_be_seen(self, solid: Solid, position: Array) -> bool:
+        away = float(np.linalg.norm(solid.center - position))
+        if away - solid.reach >= self._radius:
+            return False
+        lens = Surroundings(len(position))
+        lens.update([solid], np.zeros((1, len(position))), np.zeros(1))
+        # What is a hair's breadth within the radius may be seen or not.
+        return float(lens.clearances(position[None, None], 1.0, 1.0)[0]) < self._radius - 1e-6
