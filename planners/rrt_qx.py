@@ -282,6 +282,11 @@ class Navigator:
         self._told: Array | None = None
         self._asked: tuple[float, Array] | None = None
 
+    @property
+    def has_route(self) -> bool:
+        """Whether the planner has a route now."""
+        return self._update.route is not None
+
     def step(self, time: float, state: Array, sightings: Sequence[Sighting]) -> Order:
         """One sample: look, replan, and say where to go from `state` `[n]`."""
         if self.phase is Phase.ARRIVED:

@@ -94,6 +94,24 @@ class Regulate(Common):
 
 
 @dataclass(frozen=True)
+class Navigate(Common):
+    """Drive robots of unknown dynamics across a world whose obstacles come, go and move.
+
+    Example: zermelo navigate sims/scenarios/figure-2.toml --out out
+    """
+
+    scenario: tyro.conf.Positional[Path] = tyro.MISSING
+    """Scenario file (TOML)."""
+    controller: str = "q-learning"
+    """q-learning (the law that converges), paper-literal, paper-repaired, riccati or open-loop."""
+
+    def run(self) -> int:
+        from sims.navigate_command import run
+
+        return run(self)
+
+
+@dataclass(frozen=True)
 class Bench(Common):
     """Measure what the project claims: accuracy, success, time."""
 
@@ -143,6 +161,7 @@ Command = (
     Annotated[Plan, tyro.conf.subcommand("plan")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Regulate, tyro.conf.subcommand("regulate")]
+    | Annotated[Navigate, tyro.conf.subcommand("navigate")]
     | Annotated[Store, tyro.conf.subcommand("store")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )

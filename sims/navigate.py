@@ -22,12 +22,15 @@ from sims.navigation_controllers import (
     ExactController,
     make_controller,
 )
+from sims.navigation_record import Moment, Recorder
 from sims.scenario_file import Robot, Scenario
 
 Array = NDArray[np.float64]
 
 FORESEEING = ("q-learning", "riccati")
 """Controllers that can forecast: they drive by our rules, the others by the paper's."""
+EVERY = 0.25
+"""Seconds between the moments that pictures are made of."""
 BRAKES = np.linspace(-0.5, 2.0, 26)
 NODES = {2: 2000, 3: 3000}
 CAUSES = {
@@ -57,6 +60,7 @@ class Navigation:
         duration: seconds until it arrived, or until the run ended.
         sample_period: seconds.
         wall_seconds: of the whole simulation, all robots.
+        moments: what the robot knew and planned every `EVERY` seconds, if that was recorded.
     """
 
     robot: Robot
@@ -76,6 +80,7 @@ class Navigation:
     duration: float
     sample_period: float
     wall_seconds: float
+    moments: list[Moment]
 
     @property
     def length(self) -> float:
@@ -154,6 +159,7 @@ def run(
     controller: str = "q-learning",
     seed: int = 0,
     rules: Rules | None = None,
+    record: bool = False,
     **settings: Any,
 ) -> list[Navigation]:
     """Run a scenario; one `Navigation` a robot.
@@ -164,6 +170,7 @@ def run(
         seed: of the planner's samples and of the learner's probing.
         rules: which of the paper's rules are kept; by default ours for controllers that can
             forecast, the paper's for the others.
+        record: keep moments for pictures.
         **settings: of `NavigatorSettings`.
 
     Raises:
@@ -202,12 +209,14 @@ def run(
         )
         drivers.append(driver)
         stopping.append(stopping_time(robot, scenario.sample_period))
-    driven = drive(scenario, navigators, drivers, np.array(stopping))
+    recorders = [Recorder(EVERY) if record else None for _ in navigators]
+    driven = drive(scenario, navigators, drivers, np.array(stopping), recorders)
     judge = driven.judge
     fine, track = np.array(judge.times), np.array(judge.positions)
     clearances = np.array(judge.clearances)
     runs = []
     for number, robot in enumerate(scenario.robots):
+        kept = recorders[number]
         samples, navigator = driven.samples[number], navigators[number]
         reached = navigator.phase is Phase.ARRIVED and number not in judge.hit
         arrivals = [s.time for s in samples if s.order.phase is Phase.ARRIVED]
@@ -230,6 +239,7 @@ def run(
                 arrivals[0] if reached else float(fine[-1]),
                 scenario.sample_period,
                 driven.wall_seconds,
+                kept.moments if kept is not None else [],
             )
         )
     return runs

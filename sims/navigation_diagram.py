@@ -1,6 +1,7 @@
 """Navigation as one Drake Diagram: plants, controllers, eyes, planners and the scene."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from pydrake.systems.primitives import LinearSystem, Multiplexer
 
 from planners.rrt_qx import Navigator, Order, Phase
 from sims.navigation_controllers import Driver
+from sims.navigation_record import Recorder
 from sims.navigation_scene import Bodies, Eyes, Visitors, in_space
 from sims.scenario_file import Scenario
 
@@ -33,9 +35,9 @@ class PlannerSystem(LeafSystem):
     asks for it, so that planning and control happen at the same instant.
     """
 
-    def __init__(self, navigator: Navigator, n: int) -> None:
+    def __init__(self, navigator: Navigator, n: int, recorder: Recorder | None) -> None:
         super().__init__()
-        self.navigator = navigator
+        self._navigator, self._recorder = navigator, recorder
         self._time, self._order, self.seconds = -1.0, None, 0.0
         self.DeclareVectorInputPort("state", n)
         self.DeclareAbstractInputPort("sightings", Value([]))
@@ -49,9 +51,11 @@ class PlannerSystem(LeafSystem):
             state: Any = self.get_input_port(0).Eval(context)
             sightings: Any = self.get_input_port(1).Eval(context)
             begun = time.perf_counter()
-            self._order = self.navigator.step(now, np.array(state), sightings)
+            self._order = self._navigator.step(now, np.array(state), sightings)
             self.seconds = time.perf_counter() - begun
             self._time = now
+            if self._recorder is not None:
+                self._recorder.look(now, np.array(state), self._navigator, self._order)
         out.set_value(self._order)
 
 
@@ -177,7 +181,11 @@ class Drive:
 
 
 def drive(
-    scenario: Scenario, navigators: list[Navigator], drivers: list[Driver], stopping: Array
+    scenario: Scenario,
+    navigators: list[Navigator],
+    drivers: list[Driver],
+    stopping: Array,
+    recorders: Sequence[Recorder | None],
 ) -> Drive:
     """Run a scenario in Drake's Simulator until all arrived, one collided, or time is up.
 
@@ -185,6 +193,7 @@ def drive(
         scenario: the world and its robots.
         navigators, drivers: of each robot; used up by the run.
         stopping: `[robots]`, seconds: stopping distance over speed, for obstacles that keep away.
+        recorders: of each robot; `None` keeps nothing for pictures.
     """
     builder: Any = DiagramBuilder()
     scene = builder.AddSystem(SceneGraph())
@@ -207,7 +216,7 @@ def drive(
         )
         body = builder.AddSystem(LinearSystem(*matrices))
         eyes = builder.AddSystem(Eyes(scenario, number, visitors, bodies))
-        planner = builder.AddSystem(PlannerSystem(navigators[number], n))
+        planner = builder.AddSystem(PlannerSystem(navigators[number], n, recorders[number]))
         controller = builder.AddSystem(
             ControllerSystem(drivers[number], planner, n, m, plant.anchored, scenario.sample_period)
         )
