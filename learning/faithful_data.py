@@ -56,6 +56,11 @@ def supervision(query: Query, settings: DataSettings, seed: tuple[int, int]) -> 
         solved = solve_set_valued(query, grid, chosen)
         values, inputs = solved.value.flat, solved.inputs.reshape(len(nodes), -1)
     known = np.isfinite(values)
+    if not (values[known] > 0).any():
+        raise ValueError(
+            f"data.grid: {list(settings.grid)} is too coarse for the goal of radius "
+            f"{query.goal.radius:g} m: no state outside it has a value"
+        )
     return Supervision(nodes[known], values[known], inputs[known])
 
 

@@ -112,6 +112,7 @@ class FeatureMap:
 
     def directions(self, states: Array, velocities: Array) -> Array:
         """Rates `[..., p]` of the features at states `[..., n]` moving at `velocities`."""
+        states, velocities = np.broadcast_arrays(states, velocities)
         columns = []
         for i, c in enumerate(self.system.coordinates):
             v = velocities[..., i]
