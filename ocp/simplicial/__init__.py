@@ -1,0 +1,1 @@
+"""Values on conforming simplicial meshes that are refined where it pays."""
