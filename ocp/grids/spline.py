@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ocp.compiled.jit import MATRIX, VECTOR, compiled
 from ocp.grid import Grid, GridValue
 
-PAD = 6  # nodes added on every side along axes that are not periodic
+PAD = 16  # nodes added on every side of an axis that is not periodic; what is beyond counts 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +66,7 @@ class SplineValue:
 
         padded = self.on_grid.values
         widths = [(0, 0) if periodic else (PAD, PAD) for periodic in self.grid.periodic]
-        if min(self.grid.shape) > PAD:
-            padded = np.pad(padded, widths, mode="reflect", reflect_type="odd")
-        else:
-            raise ValueError(f"grid.shape: a spline needs more than {PAD} nodes an axis")
+        padded = np.pad(padded, widths, mode="reflect", reflect_type="odd")
         for axis, periodic in enumerate(self.grid.periodic):
             mode = "grid-wrap" if periodic else "mirror"
             padded = spline_filter1d(padded, 3, axis, mode=mode)
