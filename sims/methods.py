@@ -23,10 +23,12 @@ class Method:
     Attributes:
         summary: one line on what it does.
         planner: makes it; imports what it needs.
+        period: seconds for which the closed loop holds each input.
     """
 
     summary: str
     planner: Callable[[], Planner]
+    period: float = 0.02
 
     def rehearse(self, query: Query) -> None:
         """Solve a query of the same kind, so that a timed solve finds all compiled code loaded.
@@ -78,8 +80,37 @@ def _set_valued() -> OneShot:
     return OneShot(solve)
 
 
+def _mpc() -> OneShot:
+    from ocp.mpc import receding_horizon
+
+    def solve(query: Query, starts: Sequence[NDArray[np.float64]]) -> Answer:
+        policy = receding_horizon(query)
+        if len(starts):
+            policy(np.array(starts))
+        return policy, policy.value
+
+    return OneShot(solve)
+
+
+def _mpc_value() -> OneShot:
+    from ocp.eikonal import solve_eikonal
+    from ocp.grids.spline import SplineValue
+    from ocp.mpc import ValueEnd, receding_horizon
+
+    def solve(query: Query, starts: Sequence[NDArray[np.float64]]) -> Answer:
+        value = SplineValue(solve_eikonal(query).value.on_grid)
+        policy = receding_horizon(query, ValueEnd.of(query, value))
+        if len(starts):
+            policy(np.array(starts))
+        return policy, policy.value
+
+    return OneShot(solve)
+
+
 METHODS: dict[str, Method] = {
     "exact": Method("Pontryagin shooting from every state the robot meets", _exact),
     "eikonal": Method("fast marching on a grid, interpolated one-step lookahead", _eikonal),
     "set-valued": Method("the set-valued method of Xu and Zhu on its coarse grid", _set_valued),
+    "mpc": Method("receding horizon of 2 s, quadratic cost at its end", _mpc, 0.1),
+    "mpc-value": Method("receding horizon of 2 s, the eikonal value at its end", _mpc_value, 0.1),
 }

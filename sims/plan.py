@@ -16,7 +16,7 @@ from ocp.pontryagin import ExactValue
 from ocp.query import Query
 from ocp.query_file import query_to_dict
 from ocp.trajectory import SolveError, Trajectory
-from sims.closed_loop import Rollout, rollouts
+from sims.closed_loop import LoopSettings, Rollout, rollouts
 from sims.exit_status import UNSOLVED, reading_input
 from sims.methods import METHODS
 
@@ -87,7 +87,7 @@ def solve(
     if seconds is not None:
         until = until | deadline(seconds)
     answer = plan(chosen.planner(), query, starts, until)
-    loops = rollouts(answer.policy, starts)
+    loops = rollouts(answer.policy, starts, LoopSettings(period=chosen.period))
     outcomes = []
     with notes.status("exact optimum") as status:
         for k, (start, loop) in enumerate(zip(starts, loops, strict=True), 1):

@@ -16,6 +16,9 @@ from sims.methods import METHODS
 QUERIES = Path(__file__).resolve().parents[2] / "sims" / "queries"
 START = ["--start", "-4", "-4", "-0.7853981633974483"]
 
+LARGEST_EXCESS = {"set-valued": 0.06, "mpc": 0.21}
+"""From START to (4, 4); MPC's is that of the paper's own MPC. Others: 0.4 %."""
+
 
 def zermelo(capsys, monkeypatch, *arguments: str) -> tuple[int, str, str]:
     """Exit status, standard output and standard error of a command."""
@@ -64,7 +67,7 @@ def test_plan_prints_one_json_document(method: str, run) -> None:
     assert start["exact_cost"] == pytest.approx(TABLE_ONE_OPTIMA[4.0, 4.0], abs=5e-5)
     assert start["excess"] == pytest.approx(start["cost"] / start["exact_cost"] - 1)
     # No closed loop beats the optimum by more than what the goal's tolerance of 1 mm is worth.
-    assert -1e-4 < start["excess"] < (0.004 if method != "set-valued" else 0.06)
+    assert -1e-4 < start["excess"] < LARGEST_EXCESS.get(method, 0.004)
 
 
 def test_several_starts_without_the_exact_optimum(run) -> None:
