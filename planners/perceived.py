@@ -81,9 +81,9 @@ class Perceived:
         self.surroundings = Surroundings(dimension)
 
     @property
-    def solids(self) -> list[Solid]:
-        """All that is known of, where it was seen last."""
-        return [known.solid for known in self._known.values()]
+    def known(self) -> list[tuple[int, Solid]]:
+        """All that is known of, by key, where it was seen last."""
+        return [(key, known.solid) for key, known in self._known.items()]
 
     @property
     def moving(self) -> bool:

@@ -36,8 +36,6 @@ def run(command: "cli.Navigate") -> int:
         from sims.navigation_figure import save_pictures
 
         write_text(command.out / "navigate.json", json.dumps(report, indent=1) + "\n")
-        with np.errstate(all="ignore"):
-            pass
         save_pictures(scenario, runs, command.out)
         Console(stderr=True).print(f"pictures and data: {command.out}")
     return 0 if report["reached"] and not report["collided"] else UNSOLVED

@@ -22,7 +22,7 @@ class Moment:
         order: what the navigator said.
         tree: RRT^X's tree and graph.
         route: `[k, d]`; `None` if there is none.
-        solids: what the robot knows of.
+        known: what the robot knows of, by key; other robots have negative ones.
     """
 
     time: float
@@ -30,7 +30,12 @@ class Moment:
     order: Order
     tree: TreeView
     route: Array | None
-    solids: list[Solid]
+    known: list[tuple[int, Solid]]
+
+    @property
+    def solids(self) -> list[Solid]:
+        """What the robot knows of."""
+        return [solid for _, solid in self.known]
 
 
 class Recorder:
@@ -54,6 +59,6 @@ class Recorder:
                 order,
                 navigator.planner.view(),
                 route,
-                list(navigator.perceived.solids),
+                navigator.perceived.known,
             )
         )
