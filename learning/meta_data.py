@@ -8,12 +8,10 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from learning.losses import Samples, Structure
 from ocp.compiled.batch import rates, state_costs
@@ -98,8 +96,8 @@ class FeatureMap:
         """p, the number of features."""
         return self.system.n + sum(c.periodic for c in self.system.coordinates)
 
-    def features(self, query: Query, states: Array) -> Array:
-        """`[..., p]` at states `[..., n]`."""
+    def features(self, states: Array, reference: Array) -> Array:
+        """`[..., p]` at states `[..., n]`; `reference` `[..., n]` is the query's."""
         columns = []
         for i, c in enumerate(self.system.coordinates):
             x = states[..., i]
@@ -107,7 +105,7 @@ class FeatureMap:
                 angle = 2 * np.pi / c.extent * x
                 columns += [np.sin(angle), np.cos(angle)]
             else:
-                columns.append(x - query.reference[i] if self.relative else x)
+                columns.append(x - reference[..., i] if self.relative else x)
         return np.stack(columns, axis=-1)
 
     def directions(self, states: Array, velocities: Array) -> Array:
@@ -189,60 +187,59 @@ class SampleMap:
     dtype: torch.dtype = torch.float32
 
     def samples(self, query: Query, data: Supervision) -> Samples:
-        """The tensors.
+        """The tensors of one query, without a leading axis.
 
         Raises:
             SolveError: NOT_APPLICABLE for bounded inputs, where h(grad V) is clipped.
         """
-        if query.is_bounded:
+        batch = self.batch([query], [data])
+        fields = {name: getattr(batch, name)[0] for name in Samples.__dataclass_fields__}
+        return Samples(**(fields | {"rates": batch.rates}))
+
+    def batch(self, queries: Sequence[Query], data: Sequence[Supervision]) -> Samples:
+        """The tensors of queries of one robot and equal input weights, as many samples of each.
+
+        Raises:
+            SolveError: NOT_APPLICABLE for bounded inputs.
+        """
+        if any(query.is_bounded for query in queries):
             raise SolveError(Status.NOT_APPLICABLE, "the losses need unbounded inputs")
-        fmap, states = self.features, data.states
-        columns = input_columns(query, states)
-        rate = -1 / (2 * query.input_weights)
+        fmap, states = self.features, np.stack([d.states for d in data])
+        columns = input_columns(queries[0], states)
+        rate = -1 / (2 * queries[0].input_weights)
         along = columns * rate[:, None]  # -G_j / (2 R_j)
-        shifted = states[:, None, :] + self.step * columns
-        empty = np.zeros((0,))
-        bound, slopes = empty, empty
+        shifted = (states[:, :, None, :] + self.step * columns).swapaxes(1, 2)
+        references = np.stack([query.reference for query in queries])
+        bounds, slopes = np.zeros((len(queries), 0)), np.zeros((len(queries), 0))
         if self.structure is Structure.BOUND:
-            exact = DistanceBound(query)
-            bound = exact.value(states)
-            slopes = (along * exact.gradient(states)[:, None, :]).sum(-1)
+            exact = [DistanceBound(query) for query in queries]
+            bounds = np.stack([b.value(x) for b, x in zip(exact, states, strict=True)])
+            gradients = np.stack([b.gradient(x) for b, x in zip(exact, states, strict=True)])
+            slopes = (along * gradients[:, :, None, :]).sum(-1)
         arrays = (
-            fmap.features(query, states),
-            fmap.features(query, shifted).transpose(1, 0, 2),
-            fmap.directions(states[:, None, :], along),
+            fmap.features(states, references[:, None, :]),
+            fmap.features(shifted, references[:, None, None, :]),
+            fmap.directions(states[:, :, None, :], along),
             rate / self.step,
-            data.values,
-            data.inputs,
-            bound,
+            np.stack([d.values for d in data]),
+            np.stack([d.inputs for d in data]),
+            bounds,
             slopes,
         )
         return Samples(*(torch.from_numpy(np.ascontiguousarray(a)).to(self.dtype) for a in arrays))
 
 
 def input_columns(query: Query, states: Array) -> Array:
-    """Columns G_j(x) `[k, m, n]` of the input matrix at states `[k, n]`."""
+    """Columns G_j(x) `[..., m, n]` of the input matrix at states `[..., n]`."""
     m = query.system.m
-    rest = rates(query, states, np.zeros((len(states), m)))
-    unit = [rates(query, states, np.broadcast_to(e, (len(states), m))) - rest for e in np.eye(m)]
-    return np.stack(unit, axis=1)
-
-
-def stacked(batch: Sequence[Samples]) -> Samples:
-    """Samples of several queries with a leading axis, one a query."""
-    fields: dict[str, Any] = {
-        name: torch.stack([getattr(s, name) for s in batch])
-        for name in Samples.__dataclass_fields__
-    }
-    return Samples(**(fields | {"rates": batch[0].rates}))
+    shape = (*states.shape[:-1], m)
+    rest = rates(query, states, np.zeros(shape))
+    unit = [rates(query, states, np.broadcast_to(e, shape)) - rest for e in np.eye(m)]
+    return np.stack(unit, axis=-2)
 
 
 class QueryTable:
-    """The training data sets D_i^tr of many queries, from which minibatches are drawn.
-
-    All share one set of states if they come from one grid; then what depends on the states alone
-    is stored once.
-    """
+    """The training data sets D_i^tr of many queries, from which minibatches are drawn."""
 
     def __init__(
         self, queries: Sequence[Query], data: Sequence[Supervision], sample_map: SampleMap
@@ -257,17 +254,16 @@ class QueryTable:
         The batches of a query have no sample in common.
         """
         chosen = rng.choice(len(self.queries), queries, replace=False)
-        batches: list[list[Samples]] = [[] for _ in counts]
+        batches: list[list[Supervision]] = [[] for _ in counts]
         for i in chosen:
             data = self.data[i]
             picked = rng.choice(len(data), sum(counts), replace=False)
             start = 0
             for batch, count in zip(batches, counts, strict=True):
                 rows = picked[start : start + count]
-                part = Supervision(data.states[rows], data.values[rows], data.inputs[rows])
-                batch.append(self.map.samples(self.queries[i], part))
+                batch.append(Supervision(data.states[rows], data.values[rows], data.inputs[rows]))
                 start += count
-        return [stacked(b) for b in batches]
+        return [self.map.batch([self.queries[i] for i in chosen], batch) for batch in batches]
 
     @cached_property
     def digest(self) -> str:
@@ -277,8 +273,3 @@ class QueryTable:
             for array in (part.states, part.values, part.inputs):
                 found.update(np.ascontiguousarray(array).tobytes())
         return found.hexdigest()[:16]
-
-
-def as_tensors(arrays: Sequence[Array], dtype: torch.dtype = torch.float32) -> list[Tensor]:
-    """Copies of arrays as tensors."""
-    return [torch.tensor(a, dtype=dtype) for a in arrays]

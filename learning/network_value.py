@@ -36,7 +36,7 @@ class NetworkValue:
         """V `[...]` at states `[..., n]`."""
         states = self._checked(states)
         with torch.no_grad():
-            outputs = self._pass(states).outputs.double().numpy()
+            outputs = self._pass(states).outputs.double().numpy().reshape(states.shape[:-1])
         if self.settings.structure is Structure.BOUND:
             outputs = self._bound.value(states) * (1 + np.logaddexp(0.0, outputs))
         return np.where(self.query.goal_distance(states) <= 0, 0.0, np.maximum(outputs, 0.0))
@@ -47,7 +47,8 @@ class NetworkValue:
         with torch.no_grad():
             passed = self._pass(states)
             slopes = passed.feature_gradient().double().numpy()
-            outputs = passed.outputs.double().numpy()
+            outputs = passed.outputs.double().numpy().reshape(states.shape[:-1])
+        slopes = slopes.reshape(*states.shape[:-1], -1)
         gradient = self._features.state_gradient(states, slopes)
         if self.settings.structure is Structure.BOUND:
             bound, along = self._bound.value(states), self._bound.gradient(states)
@@ -60,7 +61,9 @@ class NetworkValue:
         return np.where(outside[..., None], gradient, 0.0)
 
     def _pass(self, states: Array) -> ForwardPass:
-        features = torch.from_numpy(self._features.features(self.query, states))
+        """Over the states as rows."""
+        rows = states.reshape(-1, states.shape[-1])
+        features = torch.from_numpy(self._features.features(rows, self.query.reference))
         features = features.to(self.parameters[0].dtype)
         return ForwardPass(self.parameters, features, self.settings.activation)
 
