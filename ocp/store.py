@@ -13,7 +13,7 @@ import socket
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -222,12 +222,14 @@ class Filling:
     Attributes:
         present: keys that were there already.
         computed: keys of new entries, solved or with the solver's own failure.
+        unsolved: of these, the ones that hold the solver's own failure.
         replaced: keys of damaged entries that were computed anew, and what was wrong.
         failed: keys of orders without an entry: the task failed.
     """
 
     present: list[str] = field(default_factory=list)
     computed: list[str] = field(default_factory=list)
+    unsolved: dict[str, Status] = field(default_factory=dict)
     replaced: dict[str, str] = field(default_factory=dict)
     failed: dict[str, Failure] = field(default_factory=dict)
 
@@ -277,37 +279,48 @@ def fill(
         if outcome.failure is not None:
             filling.failed[order.key] = outcome.failure
         else:
-            if isinstance(outcome.answer, Unwritten):
-                raise OSError(outcome.answer.why)
-            if outcome.answer is not None:
-                store.write(order, outcome.answer)
+            answer: Fulfilled = outcome.answer
+            if answer.problem is not None:
+                raise OSError(answer.problem)
+            if not answer.stored:
+                store.write(order, answer.solved)
             filling.computed.append(order.key)
+            if answer.solved.status is not Status.SOLVED:
+                filling.unsolved[order.key] = answer.solved.status
         if notify is not None:
             notify(filling)
     return filling
 
 
 @dataclass(frozen=True)
-class Unwritten:
-    """A worker could not write its answer: the disk is full, or the folder read-only."""
+class Fulfilled:
+    """What a worker says of an order.
 
-    why: str
+    Attributes:
+        solved: the answer; without its arrays where the worker has stored it.
+        stored: whether it has.
+        problem: why it could not: the disk is full, or the folder read-only.
+    """
+
+    solved: Solved
+    stored: bool = False
+    problem: str | None = None
 
 
-def fulfil(task: tuple[Order, str | None]) -> Solved | Unwritten | None:
+def fulfil(task: tuple[Order, str | None]) -> Fulfilled:
     """Carry out an order; store the answer if a folder is given, else return it."""
     order, folder = task
     if folder is None:
-        return carry_out(order)
+        return Fulfilled(carry_out(order))
     store = Store(folder, create=False)
-    if order in store:
-        return None  # done by a worker that died before it could say so
+    if order in store:  # done by a worker that died before it could say so
+        return Fulfilled(replace(store.read(order.key).solved, arrays={}), stored=True)
     solved = carry_out(order)
     try:
         store.write(order, solved)
     except OSError as error:
-        return Unwritten(str(error))
-    return None
+        return Fulfilled(replace(solved, arrays={}), problem=str(error))
+    return Fulfilled(replace(solved, arrays={}), stored=True)
 
 
 def grid_value(entry: Entry) -> Any:

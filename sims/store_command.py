@@ -17,7 +17,6 @@ from ocp.query_file import query_from_dict
 from ocp.store import Filling, Store, fill
 from ocp.store_schema import Entry, Order, StoreError
 from ocp.store_solvers import SOLVERS, order
-from ocp.trajectory import Status
 from sims.exit_status import UNSOLVED, reading_input
 
 if TYPE_CHECKING:
@@ -181,7 +180,7 @@ def _fill(command: "cli.Store", store: Store) -> Result:
         "computed": len(filling.computed),
         "replaced": filling.replaced,
         "failed": failed,
-        "unsolved": sum(store.read(k).solved.status is not Status.SOLVED for k in filling.computed),
+        "unsolved": {key: status.name for key, status in filling.unsolved.items()},
     }
     text = (
         f"{len(filling.computed)} computed, {len(filling.present)} were there, "

@@ -3,22 +3,24 @@
 import importlib
 import os
 import platform
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from rich.table import Table
+if TYPE_CHECKING:
+    from rich.table import Table
 
 BENCHMARKS: dict[str, str] = {
     "exact": "exact costs, closed form, success and time of exact trajectories",
+    "execution": "speed-up of two workers, what Dask adds a task, worker deaths survived",
     "grids": "eikonal and set-valued grids: time, value error, closed-loop excess",
     "lqr": "analytic LQR: Riccati, matrix exponential, collocation and PMP",
     "orders": "orders of convergence of the grid schemes, on and off the axis",
     "rrtx": "RRT^X: repair after changes, against growth from scratch, OMPL and the optimum",
+    "store": "value store: time and bytes an entry, kills survived",
 }
 """Name of the module in this folder, and what it measures."""
 
@@ -33,7 +35,7 @@ class Report:
     """
 
     figures: dict[str, Any] = field(default_factory=dict)
-    tables: list[Table] = field(default_factory=list)
+    tables: list["Table"] = field(default_factory=list)
 
 
 def run_benchmark(name: str, seed: int, out: Path | None) -> Report:
@@ -49,11 +51,13 @@ def median_seconds(task: Callable[[], Any], repeats: int = 5) -> float:
         begun = time.perf_counter()
         task()
         times.append(time.perf_counter() - begun)
-    return float(np.median(times))
+    return statistics.median(times)
 
 
 def machine() -> dict[str, Any]:
     """What the figures were measured on."""
+    from importlib.metadata import version
+
     return {
         "processor": platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0))

@@ -133,6 +133,7 @@ def test_a_solvers_own_failure_is_an_answer(tmp_path: Path) -> None:
     bounded = Query("unicycle", Goal((0.0, 0.0), 0.5), input_upper=(1.0, 1.0))
     asked = order(bounded, "eikonal", {**NODES, "scheme": "FAST_MARCHING"})
     first, second = fill(store, [asked]), fill(store, [asked])
+    assert first.unsolved == {asked.key: Status.NOT_APPLICABLE}
     assert (first.computed, second.present) == ([asked.key], [asked.key])
     entry = store.get(asked)
     assert entry is not None
