@@ -17,7 +17,7 @@ LARGEST_NODES = 4000
 
 @dataclass(frozen=True, eq=False)
 class QFunction:
-    """Q(x, u, t) = [x; u]' [[xx, ux'], [ux, uu]] [x; u], the paper's (13) without its one half.
+    """Q(x, u, t) = x' xx x + 2 u' ux x + u' uu u, the paper's (13) without its one half.
 
     Attributes:
         xx: `[..., n, n]` = dP/dt + P + M + PA + A'P.
