@@ -125,4 +125,6 @@ def value_and_slopes(
     extra = nn.functional.softplus(n)
     V_free = batch.free[:, 0]
     V = V_free * (1 + extra)
-    return V, batch.free[:, 1:] * (1 + extra)[:, None] + (V_free * torch.sigmoid(n))[:, None] * slopes
+    return V, batch.free[:, 1:] * (1 + extra)[:, None] + (V_free * torch.sigmoid(n))[
+        :, None
+    ] * slopes

@@ -109,9 +109,7 @@ class QueryEncoder:
         slopes = np.empty((count, STATE_FEATURES, 3))
         per_obstacle = np.empty((count, o, OBSTACLE_FEATURES))
         obstacle_slopes = np.empty((count, o, OBSTACLE_FEATURES, 3))
-        _encode_rows(
-            *self.arguments, rows, free, features, slopes, per_obstacle, obstacle_slopes
-        )
+        _encode_rows(*self.arguments, rows, free, features, slopes, per_obstacle, obstacle_slopes)
         return free, features, slopes, per_obstacle, obstacle_slopes
 
 
@@ -131,12 +129,13 @@ def _doubled(c, s):
     return c * c - s * s, 2.0 * c * s
 
 
-@compiled(
-    types.void(
-        ADDRESSES, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX,
-        CUBE,
-    )
-)  # fmt: skip
+_SIGNATURE = types.void(
+    ADDRESSES, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, CUBE
+)
+ENCODE = types.FunctionType(_SIGNATURE)
+
+
+@compiled(_SIGNATURE)
 def encode_state(
     functions, table, numbers, q, bare, obstacles, x, free, features, slopes, per_obstacle,
     obstacle_slopes,

@@ -140,12 +140,10 @@ def train(
         if state.step % settings.checkpoint_steps == 0 or state.step == settings.steps:
             state.seconds = time.perf_counter() - begun
             rows = np.arange(min(held_out.size, 20_000))
-            out_direction, out_value = loss_parts(
-                state.network, held_out, rows, create_graph=False
-            )
+            out_direction, out_value = loss_parts(state.network, held_out, rows, create_graph=False)
             means = sums / since
             state.curve.append(
-                (state.step, state.seconds, *means, out_direction.item(), out_value.item())
+                (state.step, state.seconds, *means.tolist(), out_direction.item(), out_value.item())
             )
             sums[:], since = 0.0, 0
             yield state

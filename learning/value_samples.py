@@ -96,7 +96,9 @@ def sample_values(query: Query, sizes: SampleSizes, rng: np.random.Generator) ->
         _known(query, table, coarse.value.on_grid, np.concatenate([starts[:anywhere], followed])),
         _known(query, table, fine, near),
     ]
-    return ValueSamples(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ValueSamples)))
+    return ValueSamples(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ValueSamples))
+    )
 
 
 def _around_goal(query: Query) -> Grid:

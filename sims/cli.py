@@ -47,8 +47,9 @@ class Plan(Common):
     """Query file (TOML)."""
     start: tyro.conf.UseAppendAction[tuple[tuple[float, ...], ...]] = ()
     """A start state, all its coordinates; repeat the option for more starts."""
-    method: str = "eikonal"
-    """exact, eikonal or set-valued."""
+    method: str | None = None
+    """adapt, exact, eikonal, set-valued or another of sims/methods.py. By default adapt, or eikonal
+    for queries that adapt's networks were not trained for (the output says so)."""
     deadline: float | None = None
     """Seconds until the policy must be ready."""
     trajectories: int | None = None

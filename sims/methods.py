@@ -15,6 +15,8 @@ from ocp.value import greedy
 
 log = logging.getLogger(__name__)
 
+REHEARSED = 3  # refinements of a rehearsal: one of each kind that a planner knows
+
 
 @dataclass(frozen=True)
 class Method:
@@ -43,7 +45,12 @@ class Method:
         start = sample_start(other, np.random.default_rng(0))
         planner = self.planner()
         try:
-            planner.policy(planner.start(other, [start]))(start)
+            state = planner.start(other, [start])
+            for _ in range(REHEARSED):
+                if state.finished:
+                    break
+                state = planner.refine(state)
+            planner.policy(state)(start)
         except SolveError:
             log.debug("rehearsal of %s ended without an answer", system.name)
 
@@ -80,6 +87,12 @@ def _set_valued() -> OneShot:
     return OneShot(solve)
 
 
+def _adapt() -> Planner:
+    from learning.meta_planner import MetaPlanner
+
+    return MetaPlanner.shipped()
+
+
 def _mpc() -> OneShot:
     from ocp.mpc import receding_horizon
 
@@ -108,9 +121,18 @@ def _mpc_value() -> OneShot:
 
 
 METHODS: dict[str, Method] = {
+    "adapt": Method("a network that knows the query, exact trajectories, then grids", _adapt),
     "exact": Method("Pontryagin shooting from every state the robot meets", _exact),
     "eikonal": Method("fast marching on a grid, interpolated one-step lookahead", _eikonal),
     "set-valued": Method("the set-valued method of Xu and Zhu on its coarse grid", _set_valued),
     "mpc": Method("receding horizon of 2 s, quadratic cost at its end", _mpc, 0.1),
     "mpc-value": Method("receding horizon of 2 s, the eikonal value at its end", _mpc_value, 0.1),
 }
+
+
+def default_method(query: Query) -> tuple[str, str | None]:
+    """The method used where none is asked for, and why it is not `adapt` if it is not."""
+    from learning.query_encoder import why_not_encodable
+
+    reason = why_not_encodable(query)
+    return ("adapt", None) if reason is None else ("eikonal", reason)

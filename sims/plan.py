@@ -18,7 +18,7 @@ from ocp.query_file import query_to_dict
 from ocp.trajectory import SolveError, Trajectory
 from sims.closed_loop import LoopSettings, Rollout, rollouts
 from sims.exit_status import UNSOLVED, reading_input
-from sims.methods import METHODS
+from sims.methods import METHODS, default_method
 
 if TYPE_CHECKING:
     from sims import cli
@@ -114,9 +114,10 @@ def run(command: "cli.Plan") -> int:
     """Run the command; returns its exit status."""
     with reading_input():
         query = Query.load(command.query)
-        if command.method not in METHODS:
+        method, reason = (command.method, None) if command.method else default_method(query)
+        if method not in METHODS:
             known = ", ".join(METHODS)
-            raise ValueError(f"method: {command.method!r} is unknown; known are {known}")
+            raise ValueError(f"method: {method!r} is unknown; known are {known}")
         if not command.start:
             raise ValueError("start: give at least one, --start X1 X2 ...")
         starts = [query.check_start(s) for s in command.start]
@@ -124,21 +125,23 @@ def run(command: "cli.Plan") -> int:
             raise ValueError(f"deadline: must be a positive number, got {command.deadline}")
         if command.trajectories is not None and command.trajectories < 1:
             raise ValueError(f"trajectories: must be at least 1, got {command.trajectories}")
+    if reason is not None:
+        notes.print(f"method: {method}, not adapt: {reason}")
     try:
         answer, outcomes = solve(
             query,
             starts,
-            command.method,
+            method,
             seconds=command.deadline,
             count=command.trajectories,
             with_exact=not command.no_exact,
         )
     except SolveError as error:
-        notes.print(f"zermelo: {command.method}: {error}")
+        notes.print(f"zermelo: {method}: {error}")
         return UNSOLVED
     document = {
         "query": query_to_dict(query),
-        "method": command.method,
+        "method": method,
         "reaction_time_s": answer.reaction_time,
         "trajectories": answer.trajectories,
         "starts": [outcome.report() for outcome in outcomes],
@@ -149,7 +152,7 @@ def run(command: "cli.Plan") -> int:
     if command.json:
         print(json.dumps(document))
     else:
-        Console().print(table(answer, command.method, outcomes))
+        Console().print(table(answer, method, outcomes))
     if command.out is not None:
         write_outputs(command.out, document, answer, outcomes)
     return 0 if any(outcome.rollout.reached for outcome in outcomes) else UNSOLVED

@@ -58,6 +58,8 @@ class Extremal:
         seconds: spent in them.
         trajectory: with costates; `None` unless solved.
         hessian: `[n, n]`, second derivatives of V at the start; `None` unless solved.
+        hessians: `[segments, n, n]`, the same where the segments begin: at every `SAMPLES`-th point
+            of the trajectory but the last (on the goal's boundary they do not exist).
         bounds_active: whether the input touches a bound somewhere. The flow is then only once
             differentiable there, and the extremal as valid.
     """
@@ -68,6 +70,7 @@ class Extremal:
     seconds: float = 0.0
     trajectory: Trajectory | None = None
     hessian: Array | None = None
+    hessians: Array | None = None
     bounds_active: bool = False
 
     @property
@@ -121,8 +124,10 @@ def find_extremal(
     lower, upper = query.input_bounds
     active = bool(((shot.motion.inputs <= lower) | (shot.motion.inputs >= upper)).any())
     n = query.system.n
-    hessian = np.linalg.solve(shot.basis[0, :n].T, shot.basis[0, n:-1].T).T
-    return Extremal(status, "", iterations, seconds, shot.motion, (hessian + hessian.T) / 2, active)
+    transposed = shot.basis[:-1].transpose(0, 2, 1)
+    hessians = np.linalg.solve(transposed[:, :, :n], transposed[:, :, n:-1]).transpose(0, 2, 1)
+    hessians = (hessians + hessians.transpose(0, 2, 1)) / 2
+    return Extremal(status, "", iterations, seconds, shot.motion, hessians[0], hessians, active)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,292 @@
+"""The main method: the policy of a network that knows the query, then better ones while time lasts.
+
+A conditioned network answers in a millisecond. Its own closed loops are the guesses from which
+exact trajectories are found; around each a tube of neighbouring extremals steers. Grids, coarse
+ones first, replace the network as the policy off the tubes where they are known to be better, and
+tell where the network chose the wrong class of motions.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from learning.compiled_network import NetworkPolicy, NetworkValue
+from learning.pretrained_weights import Pretrained, load_pretrained
+from learning.query_encoder import QueryEncoder
+from learning.tube import TubePolicy, Tubes, TubeValue
+from ocp.eikonal import solve_eikonal
+from ocp.extremals.extremal import Extremal, find_extremal
+from ocp.extremals.warm_start import rollouts, timed
+from ocp.grid import Grid
+from ocp.planning import Plan, Until, plan
+from ocp.query import Query
+from ocp.query_family import sample_start
+from ocp.trajectory import SolveError, Status, Trajectory
+from ocp.value import Policy, Value
+
+Floats = NDArray[np.float64]
+
+STRIDE = 0.15  # metres or radians: a step of the network's own closed loop
+MOST_STEPS = 400
+MARGIN = 0.5  # metres of the grids beyond the domain
+TRAJECTORIES = 8  # exact ones, from states of its own choice once all asked for are done
+GRIDS = (4_500, 18_000, 60_000, 240_000)
+EARLY = 2  # so many starts are solved exactly before any grid
+CAUTION = 1.3  # by how much a step's expected time is overestimated
+SUSPICION = 1.01  # an extremal that costs so many times a grid's value is in the wrong class
+
+
+@dataclass(frozen=True)
+class Step:
+    """One refinement: an exact trajectory from the start with this number, or a grid."""
+
+    start: int = -1
+    nodes: int = 0
+
+
+@dataclass
+class Clock:
+    """How long steps take on this machine, learned as they are taken."""
+
+    trajectory: float = 4e-3
+    grid: float = 2.5e-3
+    node: float = 0.6e-6
+
+    def expected(self, step: Step) -> float:
+        """Seconds, with caution."""
+        if step.nodes:
+            return CAUTION * (self.grid + self.node * step.nodes)
+        return CAUTION * self.trajectory
+
+    def learn(self, step: Step, seconds: float) -> None:
+        """Take note of a step's time."""
+        if step.nodes:
+            self.node += 0.5 * (max(seconds - self.grid, 0.0) / step.nodes - self.node)
+        else:
+            self.trajectory += 0.3 * (seconds - self.trajectory)
+
+
+@dataclass(frozen=True)
+class MetaState:
+    """What is known of a query so far; see `ocp.planning.PlannerState`.
+
+    Attributes:
+        query: the query.
+        network: its network's value.
+        starts: `[k, n]`, those asked for, then those of the planner's own choice.
+        asked: how many were asked for.
+        guesses: the best rough motion from each start, or `None`.
+        extremals: the best exact trajectory from each start, or `None`.
+        base: policy and value off the tubes.
+        nodes: of the grid behind `base`; 0 if it is the network's.
+        grid_policy: of the last grid solved.
+        pending: steps to come.
+        worth_nodes: of a grid as good as the network.
+        trajectories: exact trajectories used.
+        next_seconds: expected for the next step.
+    """
+
+    query: Query
+    network: NetworkValue
+    starts: Floats
+    asked: int
+    guesses: tuple[Trajectory | None, ...]
+    base: tuple[Policy, Value]
+    pending: tuple[Step, ...]
+    worth_nodes: int
+    extremals: tuple[Extremal | None, ...] = ()
+    nodes: int = 0
+    grid_policy: Policy | None = None
+    trajectories: int = 0
+    next_seconds: float = 0.0
+
+    @property
+    def finished(self) -> bool:
+        return not self.pending
+
+    @property
+    def solved(self) -> list[Extremal]:
+        """The exact trajectories found."""
+        return [e for e in self.extremals if e is not None]
+
+
+@dataclass(frozen=True)
+class MetaPlanner:
+    """A `Planner` on a trained network.
+
+    Attributes:
+        networks: the first that knows a query is used for it.
+        grids: whether to use grids at all; without, only network and exact trajectories.
+        clock: the times that steps take.
+    """
+
+    networks: tuple[Pretrained, ...]
+    grids: bool = True
+    clock: Clock = field(default_factory=Clock)
+
+    @classmethod
+    def pretrained(cls, name: str, grids: bool = True) -> "MetaPlanner":
+        """The planner on shipped weights, `paper` or `general`.
+
+        Raises:
+            ValueError: if there are no such weights, or they are damaged.
+        """
+        return cls((load_pretrained(name),), grids)
+
+    @classmethod
+    def shipped(cls, grids: bool = True) -> "MetaPlanner":
+        """The planner on all shipped weights, each used for the queries that it knows best."""
+        return cls((load_pretrained("paper"), load_pretrained("general")), grids)
+
+    def plan(
+        self, query: Query, starts: Sequence[ArrayLike] = (), until: Until | None = None
+    ) -> Plan:
+        """`ocp.plan` with this planner.
+
+        Raises:
+            ValueError: if a start does not fit.
+            SolveError: NOT_APPLICABLE if the network cannot know such a query.
+        """
+        return plan(self, query, starts, until)
+
+    def start(self, query: Query, starts: Sequence[NDArray[np.float64]]) -> MetaState:
+        """The network's policy, checked from the starts; a coarse grid's if it fails the check.
+
+        Raises:
+            SolveError: NOT_APPLICABLE if the network cannot know such a query.
+        """
+        encoder = QueryEncoder.of(query)
+        chosen = next((p for p in self.networks if p.knows(query)), None)
+        if chosen is None:
+            raise SolveError(Status.NOT_APPLICABLE, "the network was trained on other queries")
+        network = NetworkValue(encoder, chosen.weights)
+        rows = np.array(starts, dtype=float).reshape(-1, query.system.n)
+        guesses = _loops(network, rows)
+        state = MetaState(
+            query,
+            network,
+            rows,
+            len(rows),
+            guesses,
+            (NetworkPolicy(network), network),
+            self._steps(len(rows), chosen.worth_nodes),
+            chosen.worth_nodes,
+            (None,) * len(rows),
+        )
+        if self.grids and any(g is None for g in guesses):
+            state = self._grid(state, GRIDS[0])
+            state = replace(state, pending=tuple(s for s in state.pending if s.nodes != GRIDS[0]))
+        return self._timed(state)
+
+    def _steps(self, asked: int, worth_nodes: int) -> tuple[Step, ...]:
+        """Small steps first; a coarse grid at least, to tell a wrong class of motions."""
+        allowed = GRIDS if self.grids else ()
+        useful = [n for n in allowed if n > worth_nodes or n == allowed[0]]
+        exact = [Step(start=i) for i in range(asked)]
+        more = [Step(start=i) for i in range(asked, TRAJECTORIES)]
+        small = [Step(nodes=n) for n in useful if n <= 18_000]
+        large = [Step(nodes=n) for n in useful if n > 18_000]
+        first = exact + small if asked <= EARLY else small + exact
+        return (*first, *more, *large)
+
+    def refine(self, state: MetaState) -> MetaState:
+        """One exact trajectory or one grid more."""
+        step, *rest = state.pending
+        begun = time.perf_counter()
+        state = replace(state, pending=tuple(rest))
+        state = self._grid(state, step.nodes) if step.nodes else self._exact(state, step.start)
+        self.clock.learn(step, time.perf_counter() - begun)
+        return self._timed(state)
+
+    def policy(self, state: MetaState) -> Policy:
+        """Tubes around the exact trajectories, the best policy known elsewhere."""
+        if not state.solved:
+            return state.base[0]
+        return TubePolicy(Tubes.around(state.query, state.solved), state.base[0])
+
+    def value(self, state: MetaState) -> Value:
+        """V that belongs to `policy`."""
+        if not state.solved:
+            return state.base[1]
+        return TubeValue(Tubes.around(state.query, state.solved), state.base[1])
+
+    def _timed(self, state: MetaState) -> MetaState:
+        expected = self.clock.expected(state.pending[0]) if state.pending else 0.0
+        return replace(state, next_seconds=expected)
+
+    def _grid(self, state: MetaState, nodes: int) -> MetaState:
+        """Solve a grid; starts whose exact trajectory it beats are to be solved again."""
+        query = state.query
+        solution = solve_eikonal(query, Grid.for_query(query, nodes, MARGIN))
+        policy, value = solution.policy(), solution.value
+        again = []
+        guesses = list(state.guesses)
+        for i, extremal in enumerate(state.extremals):
+            known = extremal.cost if extremal is not None else np.inf
+            if guesses[i] is None or known > SUSPICION * float(value.value(state.starts[i])):
+                guesses[i] = None  # found anew with this grid when it is needed
+                again.append(Step(start=i))
+        todo = {s.start for s in state.pending}
+        again = [s for s in again if s.start not in todo]
+        better = nodes > state.worth_nodes or any(g is None for g in state.guesses)
+        return replace(
+            state,
+            guesses=tuple(guesses),
+            base=(policy, value) if better else state.base,
+            nodes=nodes if better else state.nodes,
+            grid_policy=policy,
+            pending=(*again, *state.pending),
+        )
+
+    def _exact(self, state: MetaState, i: int) -> MetaState:
+        """The exact trajectory from the i-th start, kept if it is the cheapest known from there."""
+        query = state.query
+        if i >= len(state.starts):
+            own = sample_start(query, np.random.default_rng([i, len(state.query.obstacles)]))
+            state = replace(
+                state,
+                starts=np.vstack([state.starts, own]),
+                guesses=(*state.guesses, _loops(state.network, own[None])[0]),
+                extremals=(*state.extremals, None),
+            )
+        if query.goal_distance(state.starts[i]) <= 0:
+            return state
+        guess = state.guesses[i]
+        if guess is None and state.grid_policy is not None:
+            guess = rollouts(query, state.grid_policy, state.starts[i])[0]
+        if guess is None:
+            return state
+        found = find_extremal(query, state.starts[i], guess)
+        known = state.extremals[i]
+        best = known if known is not None and known.cost <= found.cost else found
+        extremals = list(state.extremals)
+        extremals[i] = best if best.trajectory is not None else None
+        guesses = list(state.guesses)
+        guesses[i] = guess
+        return replace(
+            state,
+            extremals=tuple(extremals),
+            guesses=tuple(guesses),
+            trajectories=state.trajectories + (found.trajectory is not None),
+        )
+
+
+def _loops(network: NetworkValue, starts: Floats) -> tuple[Trajectory | None, ...]:
+    """The closed loops of a network's policy; `None` where one does not get to the goal."""
+    if not len(starts):
+        return ()
+    query = network.query
+    n, m = query.system.n, query.system.m
+    path, steps = network.drive(starts, STRIDE, MOST_STEPS)
+    found: list[Trajectory | None] = []
+    for i, count in enumerate(steps):
+        if count < 1:
+            found.append(None)
+            continue
+        states = path[: count + 1, i, :n].copy()
+        durations, inputs = path[:count, i, n + m], path[:count, i, n : n + m]
+        found.append(timed(query, states, durations.copy(), inputs.copy()))
+    return tuple(found)
