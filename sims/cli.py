@@ -113,6 +113,24 @@ class Navigate(Common):
 
 
 @dataclass(frozen=True)
+class Reproduce(Common):
+    """Run the papers' tables and figures again; write them and the paper ledger to --out.
+
+    A run that was stopped goes on where it was. Example: zermelo reproduce all --quick --out out
+    """
+
+    names: tyro.conf.Positional[tuple[str, ...]] = ()
+    """table1, table2, table3, fig1, fig2, fig3, rrtqx-fig2 or all (the default)."""
+    quick: bool = False
+    """Fewer starts, queries and repetitions: minutes instead of an hour."""
+
+    def run(self) -> int:
+        from sims.reproduce import run
+
+        return run(self)
+
+
+@dataclass(frozen=True)
 class Bench(Common):
     """Measure what the project claims: accuracy, success, time."""
 
@@ -164,6 +182,7 @@ Command = (
     | Annotated[Regulate, tyro.conf.subcommand("regulate")]
     | Annotated[Navigate, tyro.conf.subcommand("navigate")]
     | Annotated[Store, tyro.conf.subcommand("store")]
+    | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 

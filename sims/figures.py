@@ -63,7 +63,9 @@ def draw_plan(
         else:
             axes.add_patch(_disc(obstacle.center, obstacle.radius, **style))
     goal = query.goal
-    axes.add_patch(_disc(goal.center, goal.radius, facecolor=GOAL, edgecolor="black", zorder=3))
+    axes.add_patch(
+        _disc(tuple(query.goal_position), goal.radius, facecolor=GOAL, edgecolor="black", zorder=3)
+    )
     for trajectory in optima:
         if trajectory is not None:
             p = query.position(trajectory.states)
@@ -85,8 +87,10 @@ def _disc(center: Sequence[float], radius: float, **style: Any) -> Circle:
     return Circle((center[0], center[1]), radius, **style)
 
 
-def _contours(axes: Axes, query: Query, value: Value, resolution: int = 101) -> None:
-    """V minimised over the coordinates other than position, as lightly filled contours."""
+def least_over_other_coordinates(
+    query: Query, value: Value, resolution: int = 101
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """V minimised over the coordinates other than position: x `[r]`, y `[r]`, V `[r, r]`."""
     system = query.system
     others = [i for i in range(system.n) if i not in system.position]
     samples = [
@@ -100,13 +104,20 @@ def _contours(axes: Axes, query: Query, value: Value, resolution: int = 101) -> 
     states = np.empty((*mesh[0].shape, system.n))
     for column, coordinate in zip(mesh, [*system.position, *others], strict=True):
         states[..., coordinate] = column
-    least = np.asarray(value.value(states)).reshape(resolution, resolution, -1).min(axis=-1)
+    values = np.asarray(value.value(states)).reshape(resolution, resolution, -1)
+    return x, y, values.min(axis=-1)
+
+
+def _contours(axes: Axes, query: Query, value: Value) -> None:
+    """V minimised over the coordinates other than position, as lightly filled contours."""
+    system = query.system
+    x, y, least = least_over_other_coordinates(query, value)
     shown = np.ma.masked_invalid(least)
     filled = axes.contourf(x, y, shown.T, levels=24, cmap="YlGnBu_r", alpha=0.55, zorder=0)
     axes.contour(x, y, shown.T, levels=24, colors="white", linewidths=0.4, zorder=1)
     bar = axes.figure.colorbar(filled, ax=axes, fraction=0.046, pad=0.03)
-    names = " and ".join(system.coordinates[i].name for i in others)
-    bar.set_label(f"cost-to-go{f', least over {names}' if others else ''}")
+    others = [c.name for i, c in enumerate(system.coordinates) if i not in system.position]
+    bar.set_label("cost-to-go" + (f", least over {' and '.join(others)}" if others else ""))
 
 
 def _headings(axes: Axes, query: Query, trajectory: Trajectory, count: int = 12) -> None:
@@ -157,3 +168,13 @@ def save(figure: Figure, path: Path) -> Path:
         figure.savefig(temporary, dpi=160)
     plt.close(figure)
     return path
+
+
+def save_all(figure: Figure, stem: Path, suffixes: Sequence[str] = (".png", ".svg")) -> list[Path]:
+    """Write a figure in several formats, each atomically, and close it."""
+    paths = [stem.with_name(stem.name + suffix) for suffix in suffixes]
+    for path in paths:
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, dpi=160)
+    plt.close(figure)
+    return paths

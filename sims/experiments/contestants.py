@@ -1,0 +1,215 @@
+"""The methods that the tables and figures compare: the paper's rows, and ours."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ocp.planning import Answer, OneShot, Planner, Until, trajectories
+from ocp.query import Query
+from sims.methods import METHODS
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """A method at one setting.
+
+    Attributes:
+        key: names it in files.
+        label: names its row.
+        method: the name of the method in `sims.methods.METHODS`; absent where that is.
+        planner: makes it.
+        until: when it stops; by default when it has nothing left to refine.
+        row: of the paper's Table I, if it is one.
+        period: seconds for which its inputs are held; by default the method's.
+        slow: left out of quick runs.
+        note: the reading or settings that its figures rest on.
+    """
+
+    key: str
+    label: str
+    method: str
+    planner: Callable[[], Planner]
+    until: Until
+    row: str | None = None
+    period: float | None = None
+    slow: bool = False
+    note: str = ""
+
+    @property
+    def held(self) -> float:
+        """Seconds for which its inputs are held."""
+        return METHODS[self.method].period if self.period is None else self.period
+
+    @property
+    def absent(self) -> str | None:
+        """Why it cannot be run, or `None` if it can."""
+        if self.method not in METHODS:
+            return f"{self.method} is not implemented"
+        try:
+            self.planner()
+        except (ImportError, FileNotFoundError) as error:
+            return str(error)
+        return None
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What its figures depend on, for the parts."""
+        return {"contestant": self.key, "note": self.note, "period": self.period}
+
+
+NEVER = Until(lambda _: False)
+EIGHT = trajectories(8)
+
+
+def _registered(name: str) -> Callable[[], Planner]:
+    return lambda: METHODS[name].planner()
+
+
+def _set_valued(shape: str, feedback: str) -> Callable[[], Planner]:
+    def make() -> Planner:
+        from ocp import set_valued
+        from ocp.grid import Grid
+
+        coarse = shape == "coarse"
+        settings = set_valued.SetValuedSettings(step=0.4 if coarse else 0.2)
+
+        def solve(query: Query, _starts: Sequence[NDArray[np.float64]]) -> Answer:
+            grid = Grid.of(query.system, set_valued.COARSE if coarse else set_valued.FINE)
+            solution = set_valued.solve_set_valued(query, grid, settings)
+            nearest = feedback == "nearest"
+            policy = solution.nearest_node_policy() if nearest else solution.policy()
+            return policy, solution.value
+
+        return OneShot(solve)
+
+    return make
+
+
+def _refmm(simplices: int) -> Callable[[], Planner]:
+    def make() -> Planner:
+        from ocp.refmm import Refmm, RefmmSettings
+
+        return Refmm(RefmmSettings(last=simplices))
+
+    return make
+
+
+def _faithful() -> Planner:
+    from learning.faithful_planner import PRETRAINED, FaithfulPlanner
+
+    if not PRETRAINED.is_file():
+        raise FileNotFoundError("no trained weights are shipped for the paper's meta learning")
+    return FaithfulPlanner.pretrained()
+
+
+CONTESTANTS = (
+    Contestant(
+        "set-valued-fine",
+        "Set-valued method (fine grid)",
+        "set-valued",
+        _set_valued("fine", "lookahead"),
+        NEVER,
+        "Set-valued method (fine grid)",
+        note="eq. (7), nearest node as image, 116 x 116 x 71, eps 0.2 s; interpolated lookahead",
+    ),
+    Contestant(
+        "set-valued-coarse",
+        "Set-valued method (coarse grid)",
+        "set-valued",
+        _set_valued("coarse", "lookahead"),
+        NEVER,
+        "Set-valued method (coarse grid)",
+        note="eq. (7), nearest node as image, 58 x 58 x 35, eps 0.4 s; interpolated lookahead",
+    ),
+    Contestant(
+        "set-valued-nearest",
+        "Set-valued method (coarse grid, nearest-node feedback)",
+        "set-valued",
+        _set_valued("coarse", "nearest"),
+        NEVER,
+        None,
+        0.05,
+        note="the same values; the control stored at the nearest node, held 0.05 s, as the paper's "
+        "coarse row seems to be made",
+    ),
+    Contestant(
+        "refmm-fine",
+        "ReFMM (fine grid)",
+        "refmm",
+        _refmm(96_000),
+        NEVER,
+        "ReFMM (fine grid)",
+        slow=True,
+        note="96,000 simplices",
+    ),
+    Contestant(
+        "refmm-coarse",
+        "ReFMM (coarse grid)",
+        "refmm",
+        _refmm(12_000),
+        NEVER,
+        "ReFMM (coarse grid)",
+        note="12,000 simplices",
+    ),
+    Contestant(
+        "mpc",
+        "MPC",
+        "mpc",
+        _registered("mpc"),
+        NEVER,
+        "MPC",
+        note="20 steps of 0.1 s, quadratic cost at the end: 0.3 times the squared distance",
+    ),
+    Contestant(
+        "mpc-value",
+        "MPC, eikonal value at the end",
+        "mpc-value",
+        _registered("mpc-value"),
+        NEVER,
+        note="20 steps of 0.1 s, the spline of the eikonal value at the end",
+    ),
+    Contestant("trpo", "TRPO", "trpo", _registered("trpo"), NEVER, "TRPO"),
+    Contestant(
+        "interpolation",
+        "DNN interpolation",
+        "interpolation",
+        _registered("interpolation"),
+        NEVER,
+        "DNN interpolation",
+        slow=True,
+        note="section III-A2 on the coarse grid's values",
+    ),
+    Contestant(
+        "faithful",
+        "Anytime adaptation",
+        "faithful",
+        _faithful,
+        EIGHT,
+        "Anytime adaptation",
+        note="Algorithms 1 and 2 as printed, n = 8",
+    ),
+    Contestant(
+        "adapt",
+        "adapt (ours)",
+        "adapt",
+        _registered("adapt"),
+        EIGHT,
+        note="the default method: conditioned network, exact trajectories, then grids; n = 8",
+    ),
+    Contestant(
+        "eikonal",
+        "eikonal (ours)",
+        "eikonal",
+        _registered("eikonal"),
+        NEVER,
+        note="fast marching, 60,000 nodes; interpolated lookahead",
+    ),
+)
+
+
+def contestant(key: str) -> Contestant:
+    """The contestant called `key`."""
+    return next(c for c in CONTESTANTS if c.key == key)
