@@ -26,13 +26,21 @@ class Method:
         summary: one line on what it does.
         planner: makes it; imports what it needs.
         period: seconds for which the closed loop holds each input.
+        within: makes one that knows its deadline in seconds, if that changes what it does.
     """
 
     summary: str
     planner: Callable[[], Planner]
     period: float = 0.02
+    within: Callable[[float], Planner] | None = None
 
-    def rehearse(self, query: Query) -> None:
+    def planner_for(self, seconds: float | None) -> Planner:
+        """The planner for a deadline, or without one."""
+        if seconds is None or self.within is None:
+            return self.planner()
+        return self.within(seconds)
+
+    def rehearse(self, query: Query, seconds: float | None = None) -> None:
         """Solve a query of the same kind, so that a timed solve finds all compiled code loaded.
 
         The goal is moved, so that nothing of the query itself is solved.
@@ -43,7 +51,7 @@ class Method:
         moved = tuple(map(float, center + 0.1 * (middle - center)))
         other = replace(query, goal=replace(query.goal, center=moved))
         start = sample_start(other, np.random.default_rng(0))
-        planner = self.planner()
+        planner = self.planner_for(seconds)
         try:
             state = planner.start(other, [start])
             for _ in range(REHEARSED):
@@ -55,14 +63,10 @@ class Method:
             log.debug("rehearsal of %s ended without an answer", system.name)
 
 
-def _eikonal() -> OneShot:
-    from ocp.eikonal import solve_eikonal
+def _eikonal(seconds: float | None = None) -> Planner:
+    from ocp.eikonal_planner import EikonalPlanner
 
-    def solve(query: Query, _starts: Sequence[NDArray[np.float64]]) -> Answer:
-        solution = solve_eikonal(query)
-        return solution.policy(), solution.value
-
-    return OneShot(solve)
+    return EikonalPlanner(seconds)
 
 
 def _exact() -> OneShot:
@@ -123,7 +127,9 @@ def _mpc_value() -> OneShot:
 METHODS: dict[str, Method] = {
     "adapt": Method("a network that knows the query, exact trajectories, then grids", _adapt),
     "exact": Method("Pontryagin shooting from every state the robot meets", _exact),
-    "eikonal": Method("fast marching on a grid, interpolated one-step lookahead", _eikonal),
+    "eikonal": Method(
+        "fast marching on a grid, interpolated one-step lookahead", _eikonal, within=_eikonal
+    ),
     "set-valued": Method("the set-valued method of Xu and Zhu on its coarse grid", _set_valued),
     "mpc": Method("receding horizon of 2 s, quadratic cost at its end", _mpc, 0.1),
     "mpc-value": Method("receding horizon of 2 s, the eikonal value at its end", _mpc_value, 0.1),

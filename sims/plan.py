@@ -82,11 +82,11 @@ def solve(
         SolveError: if the method found no policy.
     """
     chosen = METHODS[method]
-    chosen.rehearse(query)
+    chosen.rehearse(query, seconds)
     until = trajectories(8 if count is None and seconds is None else count or 10**9)
     if seconds is not None:
         until = until | deadline(seconds)
-    answer = plan(chosen.planner(), query, starts, until)
+    answer = plan(chosen.planner_for(seconds), query, starts, until)
     loops = rollouts(answer.policy, starts, LoopSettings(period=chosen.period))
     outcomes = []
     with notes.status("exact optimum") as status:
