@@ -7,9 +7,10 @@ The value itself counts by its relative error.
 """
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ from learning.conditioned_value import ConditionedNetwork, Widths, value_and_slo
 from learning.training_data import FamilyTensors
 from learning.value_samples import SampleSizes
 from ocp.files import atomic_path
+from ocp.query_file import read_toml
+
+KIND = "conditioned"
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,50 @@ class TrainingSettings:
     value_weight: float = 2.0
     held_out: int = 20
     checkpoint_steps: int = 1000
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "warm_up", "checkpoint_steps", "held_out"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: must be at least 1, got {getattr(self, name)}")
+        if not 0 < self.rate < math.inf or not 0 <= self.value_weight < math.inf:
+            raise ValueError("rate, value_weight: must be positive finite numbers")
+        if self.data.queries <= self.held_out:
+            raise ValueError(f"data.queries: must exceed held_out, got {self.data.queries}")
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "TrainingSettings":
+        """From a TOML file of kind "conditioned".
+
+        Raises:
+            ValueError: naming the field that is wrong, missing or unknown.
+            OSError: if the file cannot be read.
+        """
+        table = read_toml(path)
+        if table.pop("kind", None) != KIND:
+            raise ValueError(f"{path}: kind: must be {KIND!r}")
+        nested = {"data": SampleSizes, "widths": Widths}
+        arguments = {
+            name: _filled(nested[name], value, f"{name}.") if name in nested else value
+            for name, value in table.items()
+        }
+        return _filled(cls, arguments, "")
+
+
+def _filled(kind: Any, table: Any, prefix: str) -> Any:
+    """An instance of a dataclass from a table; unknown and missing keys are refused."""
+    if not isinstance(table, dict):
+        raise ValueError(f"{prefix}: must be a table, got {table!r}")
+    known = {f.name: f for f in fields(kind)}
+    for key, value in table.items():
+        if key not in known:
+            raise ValueError(f"{prefix}{key}: unknown; known are {', '.join(known)}")
+        wanted = known[key].type
+        if wanted is int and (not isinstance(value, int) or isinstance(value, bool)):
+            raise ValueError(f"{prefix}{key}: must be an integer, got {value!r}")
+    for key, f in known.items():
+        if key not in table and f.default is MISSING and f.default_factory is MISSING:
+            raise ValueError(f"{prefix}{key}: missing")
+    return kind(**table)
 
 
 @dataclass

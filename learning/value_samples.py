@@ -10,8 +10,8 @@ is smooth at the goal.
 """
 
 import hashlib
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,12 @@ from learning.query_encoder import REACH
 from ocp.compiled.batch import rates, state_costs
 from ocp.eikonal import solve_eikonal
 from ocp.extremals.warm_start import rollouts
+from ocp.family_file import load_family
 from ocp.grid import Grid, GridValue
 from ocp.grids.goal_table import GoalTable, goal_table
 from ocp.query import Query
-from ocp.query_family import QueryFamily, sample_start
+from ocp.query_family import sample_start
+from ocp.query_file import query_to_dict
 
 Floats = NDArray[np.float64]
 
@@ -126,23 +128,31 @@ def _known(query: Query, table: GoalTable, value: GridValue, states: Floats) -> 
     slopes = np.einsum("kn,knm->km", gradients, directions)
     effort = 0.5 * np.linalg.norm(slopes / np.sqrt(query.input_weights), axis=1)
     needed = np.sqrt(state_costs(query, states))
-    cell = value.grid.spacing[0]
+    shift = value.grid.spacing * [1, 1, 0]  # as far as the gradient reaches
     smooth = np.abs(effort - needed) < RESIDUAL * needed
-    smooth &= np.asarray(value.grid.contains(states + [cell, cell, 0.0]))
-    smooth &= np.asarray(value.grid.contains(states - [cell, cell, 0.0]))
+    smooth &= np.asarray(value.grid.contains(states + shift))
+    smooth &= np.asarray(value.grid.contains(states - shift))
     return ValueSamples(states, values, slopes, smooth)
 
 
-def sample_family(
-    family: QueryFamily, sizes: SampleSizes, seed: int
-) -> Iterator[tuple[Query, ValueSamples]]:
-    """Queries and their samples; the i-th depends on seed and i only."""
-    for k in range(sizes.queries):
-        rng = np.random.default_rng([seed, k])
+@dataclass(frozen=True)
+class SampleTask:
+    """The k-th query of a family, and its samples: they depend on these numbers only."""
+
+    family: str
+    sizes: SampleSizes
+    seed: int
+    number: int
+
+
+def sample_query(task: SampleTask) -> tuple[dict[str, Any], ValueSamples]:
+    """The query, as the tables of a query file, and its samples."""
+    rng = np.random.default_rng([task.seed, task.number])
+    family = load_family(task.family)
+    query = family.sample(rng)
+    while not query.obstacles:
         query = family.sample(rng)
-        while not query.obstacles:
-            query = family.sample(rng)
-        yield query, sample_values(query, sizes, rng)
+    return query_to_dict(query), sample_values(query, task.sizes, rng)
 
 
 def digest(samples: list[tuple[Query, ValueSamples]]) -> str:

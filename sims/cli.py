@@ -176,12 +176,34 @@ class Store(Common):
         return run(self)
 
 
+@dataclass(frozen=True)
+class Train(Common):
+    """Train the networks behind `plan`: what is shipped again, or a configuration of one's own.
+
+    Example: zermelo train learning/configs/paper.toml --out runs
+    """
+
+    config: tyro.conf.Positional[Path | None] = None
+    """Configuration (TOML); by default those of both shipped networks, one after the other. A run
+    that was stopped goes on where it was."""
+    workers: int = 0
+    """Local worker processes that sample the data; 0 works in this one."""
+    cluster: str | None = None
+    """A Dask scheduler's address, such as tcp://127.0.0.1:8786, instead of --workers."""
+
+    def run(self) -> int:
+        from sims.train_command import run
+
+        return run(self)
+
+
 Command = (
     Annotated[Plan, tyro.conf.subcommand("plan")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Regulate, tyro.conf.subcommand("regulate")]
     | Annotated[Navigate, tyro.conf.subcommand("navigate")]
     | Annotated[Store, tyro.conf.subcommand("store")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
