@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from sims.benchmarks import BENCHMARKS
 from sims.exit_status import BAD_INPUT, BadInputError, reading_input
 
 
@@ -134,8 +135,13 @@ class Reproduce(Common):
 class Bench(Common):
     """Measure what the project claims: accuracy, success, time."""
 
-    names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """exact, grids; all of them if none is named."""
+    names: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        tyro.conf.arg(
+            help="All of them if none is named. "
+            + " ".join(f"{name}: {what}." for name, what in BENCHMARKS.items())
+        ),
+    ] = ()
 
     def run(self) -> int:
         from sims.bench import run
@@ -177,6 +183,25 @@ class Store(Common):
 
 
 @dataclass(frozen=True)
+class Live(Common):
+    """Open a window in the browser: sliders move goal, obstacles and start, and policies follow."""
+
+    query: tyro.conf.Positional[Path | None] = None
+    """Query file (TOML) of a robot in the plane; by default the paper's with its goal at (1, 4)."""
+    method: str | None = None
+    """The method to begin with."""
+    port: int | None = None
+    """Port on this machine; by default the first free one from 7000 on."""
+    seconds: float | None = None
+    """End by itself after so many seconds."""
+
+    def run(self) -> int:
+        from sims.live import run
+
+        return run(self)
+
+
+@dataclass(frozen=True)
 class Train(Common):
     """Train the networks behind `plan`: what is shipped again, or a configuration of one's own.
 
@@ -205,6 +230,7 @@ Command = (
     | Annotated[Store, tyro.conf.subcommand("store")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
+    | Annotated[Live, tyro.conf.subcommand("live")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
