@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ocp.compiled.jit import MATRIX, VECTOR, compiled, float64
 from ocp.simplicial import march as kernels
+from ocp.simplicial.mesh import Mesh
 from ocp.simplicial.solution import MeshSolution
 
 Floats = NDArray[np.float64]
@@ -34,15 +35,27 @@ def error_indicator(solution: MeshSolution, starts: Floats | None = None) -> Flo
         solution: with its values.
         starts: `[k, n]`, states that matter; the whole box if there are none.
     """
-    mesh = solution.mesh
-    curvature = np.empty(mesh.size)
-    _curvatures(mesh.cells, mesh.edge_vectors, solution.values, _gradients(solution), curvature)
-    return curvature * _traffic(solution, starts)[mesh.cells].sum(axis=1)
-
-
-def _gradients(solution: MeshSolution) -> Floats:
-    """`[N, n]`, the mean of the gradients on the leaves around each vertex, by volume."""
     mesh, values = solution.mesh, solution.values
+    mass = _mass(solution, starts)
+    between = _curvature(mesh, values)
+    # What the table takes off the scheme's error, it does not take off the interpolated value.
+    passed_on = between
+    if solution.table is not None:
+        passed_on = _curvature(mesh, values - solution.table.value(mesh.vertices))
+    return passed_on * _traffic(solution, mass)[mesh.cells].sum(axis=1) + between * mass[
+        mesh.cells
+    ].sum(axis=1)
+
+
+def _curvature(mesh: Mesh, values: Floats) -> Floats:
+    """`[M]`, the largest error of linear interpolation along the edges of each leaf."""
+    out = np.empty(mesh.size)
+    _curvatures(mesh.cells, mesh.edge_vectors, values, _gradients(mesh, values), out)
+    return out
+
+
+def _gradients(mesh: Mesh, values: Floats) -> Floats:
+    """`[N, n]`, the mean of the gradients on the leaves around each vertex, by volume."""
     corners = values[mesh.cells]
     known = np.all(np.isfinite(corners), axis=1)
     corners = np.where(known[:, None], corners, 0.0)
@@ -78,12 +91,12 @@ def _curvatures(cells, edges, values, gradients, out):
         out[row] = largest
 
 
-def _traffic(solution: MeshSolution, starts: Floats | None) -> Floats:
-    """`[N]`, how much of a unit mass comes by each vertex."""
-    mesh, values = solution.mesh, solution.values
-    mass = np.zeros(len(values))
+def _mass(solution: MeshSolution, starts: Floats | None) -> Floats:
+    """`[N]`, a unit mass where values matter: at the starts, and over the box by volume."""
+    mesh = solution.mesh
+    mass = np.zeros(len(solution.values))
     for k in range(mesh.dimension + 1):
-        mass += np.bincount(mesh.cells[:, k], mesh.volumes, len(values))
+        mass += np.bincount(mesh.cells[:, k], mesh.volumes, len(mass))
     mass /= mass.sum()
     if starts is not None and len(starts):
         vertices, weights = mesh.locate(starts)
@@ -91,9 +104,14 @@ def _traffic(solution: MeshSolution, starts: Floats | None) -> Floats:
         mass *= 1.0 - STARTS_SHARE
         share = STARTS_SHARE / len(starts) * weights[inside]
         np.add.at(mass, vertices[inside].ravel(), share.ravel())
-    total = np.zeros(len(values))
-    order = np.argsort(-values, kind="stable")
-    kernels.spread(values, *solution.scheme(), order, mass, PASSES, total)
+    return mass
+
+
+def _traffic(solution: MeshSolution, mass: Floats) -> Floats:
+    """`[N]`, how much of the mass comes by each vertex on its way to the goal."""
+    total = np.zeros(len(mass))
+    order = np.argsort(-solution.values, kind="stable")
+    kernels.spread(solution.values, *solution.scheme(), order, mass.copy(), PASSES, total)
     return total
 
 

@@ -27,9 +27,9 @@ segment_at = function_at(SEGMENT)
 def _leaf(values, point, vertices, weights):
     """The depth of the leaf at `point` `[n]`, its vertices and weights `[n + 1]`; -1 outside.
 
-    The root simplex is found by the order of the fractions in the grid's cell, then by descent: with
-    weights w in a simplex of tag k, the point lies in the first child if w_0 >= w_k, with weights
-    w_0 - w_k at x_0 and 2 w_k at the new vertex; else in the second, likewise.
+    The root simplex is found by the order of the fractions in the grid's cell, then by descent:
+    with weights w in a simplex of tag k, the point lies in the first child if w_0 >= w_k, with
+    weights w_0 - w_k at x_0 and 2 w_k at the new vertex; else in the second, likewise.
     """
     n = point.shape[0]
     count, total = int(values[4 * n]), int(values[4 * n + 1])

@@ -38,7 +38,8 @@ I1 = types.Array(int64, 1, "C")
 I2 = types.Array(int64, 2, "C")
 FLAGS = types.Array(types.uint8, 1, "C")
 
-FIRST_STAGE, NEXT_STAGE = 0.01, 0.1
+FIRST_STAGE, REPAIR_STAGE, NEXT_STAGE = 0.01, 1e-4, 0.1
+FACTOR_STEPS, FACTOR_TOLERANCE = 20, 1e-6
 OUT = -1  # place of a vertex that is not in the queue
 
 inlined = numba.njit(inline="always", error_model="numpy")
@@ -199,16 +200,29 @@ def factors(exact, span, nodes, weight, effort, cost, pieces, which, lowest, hig
     `exact` `[N]` solves the vertex's equation; the nearer bound if none does."""
     foot, at, shares = np.empty(_most_feet(span)), np.empty(3), np.empty(3)
     for v in which:
-        low, high = lowest, highest
-        for _ in range(30):  # T rises with the factor
-            factor[v] = 0.5 * (low + high)
-            value = _update(
+        # T rises with the factor. Regula falsi (Illinois), from 1 and the bound beyond the root.
+        low, high, below, above = lowest, highest, 0.0, 0.0
+        for _ in range(FACTOR_STEPS):
+            if below < 0.0 and above > 0.0:
+                factor[v] = low + (high - low) * below / (below - above)
+            else:
+                factor[v] = lowest if above > 0.0 else highest if below < 0.0 else 1.0
+            excess = _update(
                 v, exact, factor, span, nodes, weight, effort, cost, pieces, foot, at, shares
             )
-            if value < exact[v]:
-                low = factor[v]
+            excess -= exact[v]
+            if abs(excess) <= FACTOR_TOLERANCE * exact[v]:
+                break
+            if excess < 0.0:
+                if factor[v] >= highest:
+                    break
+                above *= 0.5 if below < 0.0 else 1.0
+                low, below = factor[v], excess
             else:
-                high = factor[v]
+                if factor[v] <= lowest:
+                    break
+                below *= 0.5 if above > 0.0 else 1.0
+                high, above = factor[v], excess
 
 
 @compiled(VECTOR(I2, VECTOR, VECTOR))
@@ -224,12 +238,12 @@ def least_costs(span, cost, factor):
 @compiled(
     types.UniTuple(int64, 3)(
         VECTOR, FLAGS, VECTOR, I2, I2, VECTOR, MATRIX, VECTOR, I2, I1, I1, I1, float64,
-        types.boolean, int64, I1,
+        types.boolean, int64, I1, float64,
     )
 )  # fmt: skip
 def march(
     values, fixed, factor, span, nodes, weight, effort, cost, pieces, reader_start, readers, stale,
-    tolerance, repair, budget, accepted,
+    tolerance, repair, budget, accepted, first_stage,
 ):  # fmt: skip
     """Bring `values` `[N]` to the fixed point; returns updates, acceptances and rises.
 
@@ -244,6 +258,8 @@ def march(
         repair: whether values that were accepted may change.
         budget: of updates; when it is spent, the number of updates is returned as -1.
         accepted: `[N]`, how often each was accepted; added to.
+        first_stage: the first threshold, relative as the tolerance: FIRST_STAGE from infinite
+            values, REPAIR_STAGE from values that are mostly right.
     """
     count = span.shape[0]
     foot, at, shares = np.empty(_most_feet(span)), np.empty(3), np.empty(3)
@@ -260,7 +276,7 @@ def march(
             )
             done += 1
             waiting[v] = 1
-    stage = max(FIRST_STAGE, tolerance)
+    stage = max(first_stage, tolerance)
     while True:
         for v in range(count):
             if waiting[v]:

@@ -95,13 +95,16 @@ class MeshSolution:
         return float((gap / np.where(known, least, 1.0)).max(initial=0.0))
 
     def refined(self, marked: Ints) -> "MeshSolution":
-        """The solution on the mesh with the leaves `marked` bisected: the values that this makes
-        invalid are repaired, the others are kept.
+        """The solution on the mesh with the leaves `marked` bisected, see `repaired`."""
+        return self.repaired(self.mesh.refined(marked))
+
+    def repaired(self, mesh: Mesh) -> "MeshSolution":
+        """The solution on a refinement of its mesh: the values that the refinement makes invalid
+        are repaired, the others are kept.
 
         Raises:
             SolveError: NOT_CONVERGED.
         """
-        mesh = self.mesh.refined(marked)
         old = len(self.values)
         touched = np.unique(mesh.simplices[len(self.mesh.simplices) :])
         joined = merged(self.stencils, stencils(self.query, mesh, touched), touched)
@@ -160,9 +163,11 @@ class MeshSolution:
     def _march(self, values: Floats, stale: Ints, repair: bool = True) -> Effort | None:
         """Brings `values` to the fixed point; `None` if the budget was spent."""
         accepted = np.zeros(len(values), dtype=np.int64)
+        whole = len(stale) == len(values)
+        stage = kernels.FIRST_STAGE if whole else kernels.REPAIR_STAGE
         updates, acceptances, rises = kernels.march(
             values, *self.scheme(), *self.stencils.readers(), stale, self.tolerance, repair,
-            BUDGET * len(values), accepted,
+            BUDGET * len(values), accepted, stage,
         )  # fmt: skip
         if updates < 0:
             return None

@@ -33,7 +33,7 @@ I2 = types.Array(int64, 2, "C")
 FLAGS = types.Array(types.uint8, 1, "C")
 GOAL = -1
 ROOT_STEPS = 12
-ROOT_TOLERANCE = 1e-10  # share of an edge
+ROOT_TOLERANCE = 1e-7  # share of an edge
 GAUSS = (0.21132486540518713, 0.7886751345948129)  # two-point rule on [0, 1]
 
 
@@ -257,6 +257,7 @@ def _build(
     n, m = vertices.shape[1], effort.shape[1]
     d = position.shape[0]
     obstructed = hard[2] > 0.0
+    obstacles = bare.shape[0] < q.shape[0]
     columns, point, u = np.empty((m, n)), np.empty(n), np.empty(m)
     system = np.empty((m, m + 1))
     gaps, missed = np.empty((n, n)), np.empty(n)
@@ -266,6 +267,9 @@ def _build(
     for v in which:
         largest_star = max(largest_star, start[v + 1] - start[v])
     keys = np.empty((largest_star * n, 2), dtype=np.int64)
+    # Of the vertices around the present one
+    slot = np.full(vertices.shape[0], -1, dtype=np.int64)
+    star_gaps, star_missed = np.empty((largest_star * n, n)), np.zeros(largest_star * n)
     foot, piece = 0, 0
     for v in which:
         x = vertices[v]
@@ -277,6 +281,7 @@ def _build(
         away -= goal[0] ** 2
         if away <= 0.0:
             continue
+        known_vertices = 0
         own, own_alone = np.sqrt(state_cost(x, q)), np.sqrt(bare_cost(x, bare))
         for row in range(start[v], start[v + 1]):
             size = 0
@@ -285,17 +290,22 @@ def _build(
                 if j == v:
                     continue
                 link[size] = j
-                largest = 0.0
+                if slot[j] < 0:
+                    slot[j] = known_vertices
+                    largest = 0.0
+                    for k in range(n):
+                        step = vertices[j, k] - x[k]
+                        if period[k] > 0.0:
+                            step -= period[k] * np.round(step / period[k])
+                        star_gaps[slot[j], k] = step
+                        largest = max(largest, abs(step))
+                    if m < n:
+                        off = _missed(dynamics, x, star_gaps[slot[j]], columns, u, point)
+                        star_missed[slot[j]] = 0.0 if abs(off) < 1e-11 * largest else off
+                    known_vertices += 1
                 for k in range(n):
-                    step = vertices[j, k] - x[k]
-                    if period[k] > 0.0:
-                        step -= period[k] * np.round(step / period[k])
-                    gaps[size, k] = step
-                    largest = max(largest, abs(step))
-                if m < n:
-                    missed[size] = _missed(dynamics, x, gaps[size], columns, u, point)
-                    if abs(missed[size]) < 1e-11 * largest:
-                        missed[size] = 0.0
+                    gaps[size, k] = star_gaps[slot[j], k]
+                missed[size] = star_missed[slot[j]]
                 size += 1
 
             found = 0
@@ -386,10 +396,11 @@ def _build(
                             point[k] = x[k] + 0.5 * gap[k]
                         total = own + 4.0 * np.sqrt(state_cost(point, q))
                         total += np.sqrt(state_cost(end, q))
-                        cost[foot] = total / 3.0 * length
-                        total = own_alone + 4.0 * np.sqrt(bare_cost(point, bare))
-                        total += np.sqrt(bare_cost(end, bare))
-                        alone[foot] = total / 3.0 * length
+                        cost[foot] = alone[foot] = total / 3.0 * length
+                        if obstacles:
+                            total = own_alone + 4.0 * np.sqrt(bare_cost(point, bare))
+                            total += np.sqrt(bare_cost(end, bare))
+                            alone[foot] = total / 3.0 * length
                         nodes[foot, 0], nodes[foot, 1] = one, two
                         weight[foot] = share if link[i] == one else 1.0 - share
                         if i == j:
@@ -413,5 +424,8 @@ def _build(
                     if not known:
                         pieces[piece, 0], pieces[piece, 1], pieces[piece, 2] = one, two, -1
                         piece += 1
+        for row in range(start[v], start[v + 1]):
+            for i in range(n + 1):
+                slot[cells[around[row], i]] = -1
         span[v, 1], span[v, 3] = foot, piece
     return foot, piece
