@@ -96,6 +96,8 @@ def solve_collocation(
             raise ValueError(f"{name}: must be between {least} and {most}, got {value}")
     if not 1e-10 <= tolerance < 1:
         raise ValueError(f"tolerance: must be between 1e-10 and 1, got {tolerance}")
+    if horizon is None and query.is_regulation:
+        raise ValueError("horizon: needed where the goal is an equilibrium; see exact_trajectory")
     if horizon is None and query.goal_distance(start) <= 0:
         return _at_rest(query, start)
     search = _Search(

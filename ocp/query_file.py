@@ -10,7 +10,7 @@ from typing import Any
 
 from ocp.cost import RunningCost
 from ocp.obstacle import Obstacle
-from ocp.query import Goal, Query
+from ocp.query import Equilibrium, Goal, ModelFile, Query
 from ocp.system import System
 
 
@@ -27,8 +27,8 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise ValueError(f"{path}: not a TOML file: {error}") from error
 
 
-def query_from_dict(table: Mapping[str, Any]) -> Query:
-    """A query from the tables of a query file; unknown keys are refused."""
+def query_from_dict(table: Mapping[str, Any], folder: str | os.PathLike[str] = ".") -> Query:
+    """A query from the tables of a query file in `folder`; unknown keys are refused."""
     _only(table, "", {"model", "goal", "obstacle", "cost", "input", "robot"})
     for required in ("model", "goal"):
         if required not in table:
@@ -36,20 +36,17 @@ def query_from_dict(table: Mapping[str, Any]) -> Query:
     model = table["model"]
     if not isinstance(model, str):
         raise ValueError(f"model: must be a name, got {model!r}")
-    goal = _table(table["goal"], "goal", {"center", "radius"})
-    for required in ("center", "radius"):
-        if required not in goal:
-            raise ValueError(f"goal.{required}: missing")
+    goal = _goal(table["goal"])
     obstacles = table.get("obstacle", [])
     if not isinstance(obstacles, list):
         raise ValueError("obstacle: must be an array of tables, [[obstacle]]")
     limits = _table(table.get("input", {}), "input", {"lower", "upper"})
     robot = _table(table.get("robot", {}), "robot", {"radius"})
     return Query(
-        model=model,
-        goal=Goal(_numbers(goal["center"], "goal.center"), _number(goal["radius"], "goal.radius")),
+        model=ModelFile(model, os.fspath(folder)) if _is_file(model) else model,
+        goal=goal,
         obstacles=tuple(_obstacle(o, f"obstacle {k}") for k, o in enumerate(obstacles, 1)),
-        cost=_cost(table.get("cost", {})),
+        cost=_cost(table.get("cost", {}), isinstance(goal, Equilibrium)),
         input_lower=_numbers(limits["lower"], "input.lower") if "lower" in limits else None,
         input_upper=_numbers(limits["upper"], "input.upper") if "upper" in limits else None,
         robot_radius=_number(robot.get("radius", 0.0), "robot.radius"),
@@ -64,16 +61,22 @@ def query_to_dict(query: Query) -> dict[str, Any]:
     """
     if isinstance(query.model, System):
         raise ValueError(f"model: {query.model.name!r} is not a registered name, no file holds it")
+    if query.cost.own:
+        raise ValueError("cost.own: a function of one's own, no file holds it")
+    regulation = isinstance(query.goal, Equilibrium)
+    place = {"state": list(query.goal.state)} if regulation else {"center": list(query.goal.center)}
     table: dict[str, Any] = {
-        "model": query.model,
-        "goal": {"center": list(query.goal.center), "radius": query.goal.radius},
+        "model": query.model.name if isinstance(query.model, ModelFile) else query.model,
+        "goal": {**place, "radius": query.goal.radius},
     }
     if query.obstacles:
         table["obstacle"] = [_obstacle_table(o) for o in query.obstacles]
+    defaults = {"goal": 0.0} if regulation else {}
     weights = {
         f.name: _plain(value)
         for f in fields(RunningCost)
-        if (value := getattr(query.cost, f.name)) != f.default
+        if (value := getattr(query.cost, f.name))
+        != (0.0 if regulation and f.name == "goal" else f.default)
     }
     if weights:
         table["cost"] = weights
@@ -115,6 +118,12 @@ def _numbers(value: Any, name: str) -> tuple[float, ...]:
 def _rows(value: Any, name: str) -> tuple[tuple[float, ...], ...]:
     if not isinstance(value, Sequence) or isinstance(value, str):
         raise ValueError(f"{name}: must be a list of rows, got {value!r}")
+    if value and not isinstance(value[0], Sequence):
+        diagonal = _numbers(value, name)
+        return tuple(
+            tuple(w if i == j else 0.0 for j in range(len(diagonal)))
+            for i, w in enumerate(diagonal)
+        )
     rows = tuple(_numbers(row, name) for row in value)
     if len({len(row) for row in rows}) != 1:
         raise ValueError(f"{name}: rows must be of equal length, got {value!r}")
@@ -155,9 +164,25 @@ def _obstacle_table(obstacle: Obstacle) -> dict[str, Any]:
     return table
 
 
-def _cost(value: Any) -> RunningCost:
-    table = _table(value, "cost", {f.name for f in fields(RunningCost)})
-    weights: dict[str, Any] = {}
+def _is_file(model: str) -> bool:
+    return model.endswith((".sdf", ".urdf"))
+
+
+def _goal(value: Any) -> Goal | Equilibrium:
+    goal = _table(value, "goal", {"center", "state", "radius"})
+    if ("center" in goal) == ("state" in goal):
+        raise ValueError("goal.center: missing; or give goal.state, an equilibrium, in its place")
+    if "radius" not in goal:
+        raise ValueError("goal.radius: missing")
+    radius = _number(goal["radius"], "goal.radius")
+    if "state" in goal:
+        return Equilibrium(_numbers(goal["state"], "goal.state"), radius)
+    return Goal(_numbers(goal["center"], "goal.center"), radius)
+
+
+def _cost(value: Any, regulation: bool) -> RunningCost:
+    table = _table(value, "cost", {f.name for f in fields(RunningCost)} - {"own"})
+    weights: dict[str, Any] = {"goal": 0.0} if regulation else {}
     for key, entry in table.items():
         read = {"input": _numbers, "state": _rows}.get(key, _number)
         weights[key] = read(entry, f"cost.{key}")

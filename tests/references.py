@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from ocp.cost import RunningCost
 from ocp.models import MODELS, get_model
 from ocp.obstacle import Obstacle
-from ocp.query import Goal, Query
+from ocp.query import Equilibrium, Goal, Query
 
 TABLE_ONE_OPTIMA = {
     (4.0, 4.0): 23.29976,
@@ -35,28 +35,28 @@ def aligned_value(distance: float, radius: float = 0.5, steepness: float = 3.0) 
 
 
 def typical_query(model: str, bounded: bool = False) -> Query:
-    """A query for any registered robot, with an obstacle of each shape that its space admits."""
+    """A query for any registered robot, with an obstacle of each shape that its space admits.
+
+    A robot whose positions are angles has an equilibrium as its goal: half a turn from 0 in the
+    first, where pendulums stand.
+    """
     system = get_model(model)
     d = len(system.position)
-    obstacles = [Obstacle.circle([-1.0] * d, 0.9)]
-    if d == 2:
+    angular = any(system.coordinates[i].periodic for i in system.position)
+    obstacles = [] if angular else [Obstacle.circle([-1.0] * d, 0.9)]
+    if d == 2 and not angular:
         obstacles += [
             Obstacle.diamond((-2.0, 2.0), 0.8),
             Obstacle.polygon([(2.0, -2.0), (3.0, -1.5), (2.5, -0.5), (1.7, -0.9)]),
         ]
-    quadratic = None
-    if not any(c.periodic for c in system.coordinates):
-        diagonal = np.diag(np.linspace(0.1, 0.4, system.n)) + 0.05
-        quadratic = tuple(tuple(map(float, row)) for row in diagonal)
-    cost = RunningCost(input=tuple(np.linspace(0.5, 2.0, system.m)), state=quadratic)
-    limits = (-0.8,) * system.m, (0.6,) * system.m
-    return Query(
-        model,
-        Goal((1.0,) * d, 0.5),
-        tuple(obstacles),
-        cost,
-        *(limits if bounded else (None, None)),
+    diagonal = np.diag(np.linspace(0.1, 0.4, system.n)) + 0.05
+    quadratic = tuple(tuple(map(float, row)) for row in diagonal)
+    cost = RunningCost(
+        input=tuple(np.linspace(0.5, 2.0, system.m)), state=quadratic, goal=0.0 if angular else 1.0
     )
+    limits = (-0.8,) * system.m, (0.6,) * system.m
+    goal = Equilibrium((np.pi, *[0.0] * (system.n - 1)), 0.5) if angular else Goal((1.0,) * d, 0.5)
+    return Query(model, goal, tuple(obstacles), cost, *(limits if bounded else (None, None)))
 
 
 ALL_QUERIES = [(name, bounded) for name in MODELS for bounded in (False, True)]

@@ -6,6 +6,7 @@ A CasADi call from Python costs some 25 microseconds; the same graph compiled, a
 from collections.abc import Sequence
 
 import casadi as ca
+import numpy as np
 
 UNARY = {
     ca.OP_NEG: "-{0}",
@@ -98,3 +99,61 @@ def _literal(number: float) -> str:
     if number != number or abs(number) == float("inf"):
         return f'float("{number}")'
     return repr(float(number))
+
+
+def interpreted(function: ca.Function, inputs: Sequence[str], outputs: Sequence[str]) -> list[str]:
+    """Like `statements`, but as a loop over a table of operations.
+
+    Compiling ten thousand statements takes numba a minute, a loop a second; the loop runs a few
+    times slower. The lines are the body of a function of a module that imports numpy as `np`; the
+    table is the line that begins with `TABLE`, for the module's top level.
+    """
+    rows, constants, used = [], [], []
+    first_in = np.cumsum([0, *(function.nnz_in(i) for i in range(function.n_in()))])
+    first_out = np.cumsum([0, *(function.nnz_out(i) for i in range(function.n_out()))])
+    for k in range(function.n_instructions()):
+        operation = function.instruction_id(k)
+        sources, targets = function.instruction_input(k), function.instruction_output(k)
+        if operation == ca.OP_INPUT:
+            row = [0, targets[0], first_in[sources[0]] + sources[1], 0]
+        elif operation == ca.OP_OUTPUT:
+            row = [1, first_out[targets[0]] + targets[1], sources[0], 0]
+        elif operation == ca.OP_CONST:
+            row = [2, targets[0], len(constants), 0]
+            constants.append(function.instruction_constant(k))
+        elif operation in UNARY or operation in BINARY:
+            if operation not in used:
+                used.append(operation)
+            row = [3 + used.index(operation), targets[0], *sources, 0][:4]
+        else:
+            raise ValueError(f"{function.name()}: CasADi operation {operation} has no translation")
+        rows.append([int(x) for x in row])
+    name = function.name().upper()
+    numbers = ", ".join(_literal(c) if np.isfinite(c) else "np.nan" for c in constants) or "0.0"
+    table = ", ".join(map(str, np.ravel(rows)))
+    lines = [
+        f"TABLE {name} = np.array([{table}]).reshape(-1, 4)",
+        f"TABLE {name}_CONSTANTS = np.array([{numbers}])",
+        f"given = np.empty({first_in[-1]})",
+        f"found = np.empty({first_out[-1]})",
+        f"w = np.empty({function.sz_w()})",
+    ]
+    for i, template in enumerate(inputs):
+        lines += [
+            f"given[{first_in[i] + j}] = {template.format(j)}" for j in range(function.nnz_in(i))
+        ]
+    lines += [
+        f"for k in range({len(rows)}):",
+        f"    o, t, a, b = {name}[k, 0], {name}[k, 1], {name}[k, 2], {name}[k, 3]",
+    ]
+    cases = ["w[t] = given[a]", "found[t] = w[a]", f"w[t] = {name}_CONSTANTS[a]"]
+    for operation in used:
+        template = UNARY.get(operation) or BINARY[operation]
+        cases.append(f"w[t] = {template.format('w[a]', 'w[b]')}")
+    for i, case in enumerate(cases):
+        lines += [f"    {'if' if i == 0 else 'elif'} o == {i}:", f"        {case}"]
+    for i, template in enumerate(outputs):
+        lines += [
+            f"{template.format(j)} = found[{first_out[i] + j}]" for j in range(function.nnz_out(i))
+        ]
+    return lines

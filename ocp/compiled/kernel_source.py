@@ -3,9 +3,12 @@
 import casadi as ca
 
 from ocp import cost as costs
-from ocp.compiled.codegen import statements
+from ocp.compiled.codegen import interpreted, statements
 from ocp.compiled.parameters import Layout
 from ocp.system import System
+
+LARGE = 4000
+"""Operations beyond which a function is interpreted: compiling it would take a minute."""
 
 
 def _symbol(name: str, *shape: int) -> ca.SX:
@@ -18,22 +21,34 @@ def kernel_source(system: System, layout: Layout) -> str:
     x, u, p = system.state, _symbol("u", m), _symbol("p", n)
     weight, lower, upper = _symbol("R", m), _symbol("lower", m), _symbol("upper", m)
 
+    rest = _symbol("rest", m) if layout.resting else ca.SX.zeros(m, 1)
     optimum = -(system.input_matrix.T @ p) / (2 * weight)
+    if layout.resting:
+        optimum += rest
     if layout.bounded:
         optimum = ca.fmin(ca.fmax(optimum, lower), upper)
     rate = system.drift + system.input_matrix @ u
-    hamiltonian = ca.dot(weight, u**2) + ca.dot(p, rate)  # without W
+    effort = u - rest if layout.resting else u
+    hamiltonian = ca.dot(weight, effort**2) + ca.dot(p, rate)  # without W
     costate_rate = -ca.gradient(hamiltonian, x)
     flow = ca.substitute(ca.vertcat(rate, costate_rate), u, optimum)
     z = ca.vertcat(x, p)
     limits = [weight, lower, upper]
     limit_slots = ["q[{0}]", f"q[{m} + {{0}}]", f"q[{2 * m} + {{0}}]"]
+    if layout.resting:
+        limits.append(rest)
+        limit_slots.append(f"q[{3 * m} + {{0}}]")
 
     def function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
         return ca.Function(name, inputs, [ca.densify(o) for o in outputs])
 
+    tables: list[str] = []
+
     def body(f: ca.Function, inputs: list[str], outputs: list[str]) -> str:
-        return "\n".join(f"    {line}" for line in statements(f, inputs, outputs))
+        large = f.n_instructions() > LARGE
+        lines = (interpreted if large else statements)(f, inputs, outputs)
+        tables.extend(line[6:] for line in lines if line.startswith("TABLE "))
+        return "\n".join(f"    {line}" for line in lines if not line.startswith("TABLE "))
 
     state_and_costate = ["z[{0}]", f"z[{n} + {{0}}]"]
     parts = [
@@ -81,9 +96,13 @@ def kernel_source(system: System, layout: Layout) -> str:
         "    return h + state_cost(z, q)",
         "\n@compiled(float64(VECTOR, VECTOR), KEY)\ndef running_cost(xu, q):",
         "    total = state_cost(xu, q)",
-        f"    for i in range({m}):\n        total += q[i] * xu[{n} + i] ** 2",
+        f"    for i in range({m}):",
+        f"        total += q[i] * (xu[{n} + i] - q[{3 * m} + i]) ** 2"
+        if layout.resting
+        else f"        total += q[i] * xu[{n} + i] ** 2",
         "    return total",
     ]
+    parts[4:4] = tables
     return "\n".join(parts) + "\n"
 
 
@@ -104,9 +123,12 @@ def _cost_source(system: System, layout: Layout) -> str:
     smooth = costs.goal_cost(position, center, radius, weight, steepness)
     if layout.quadratic:
         reference, M = _symbol("xg", n), _symbol("M", n, n)
-        smooth += costs.quadratic_cost(x, reference, M)
+        smooth += costs.quadratic_cost(x, reference, M, system.period)
         smooth_inputs += [reference, M]
         smooth_slots += [f"q[{layout.state} + {{0}}]", f"q[{layout.state + n} + {{0}}]"]
+
+    if layout.own_cost:
+        smooth += costs.own_cost(layout.own_cost)(x)
 
     place = _symbol("p", d)
     ball = costs.ball_penalty(place, center, radius, weight, steepness)

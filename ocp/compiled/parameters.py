@@ -11,17 +11,27 @@ from ocp.query import Query
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each number of a query stands in its parameter vector q."""
+    """Where each number of a query stands in its parameter vector q.
+
+    Attributes:
+        n, m, d: states, inputs, position coordinates.
+        quadratic: whether there is a quadratic state cost.
+        bounded: whether any input is.
+        resting: whether inputs are measured from those that hold the goal's equilibrium.
+        own_cost: the user's own cost, see `RunningCost`; it is compiled in.
+    """
 
     n: int
     m: int
     d: int
     quadratic: bool
     bounded: bool
+    resting: bool = False
+    own_cost: str = ""
 
     @property
     def goal(self) -> int:
-        return 3 * self.m
+        return (4 if self.resting else 3) * self.m
 
     @property
     def state(self) -> int:
@@ -44,6 +54,8 @@ class Layout:
             len(system.position),
             query.cost.state is not None,
             query.is_bounded,
+            query.is_regulation,
+            query.cost.own,
         )
 
 
@@ -54,7 +66,8 @@ def parameters(query: Query) -> NDArray[np.float64]:
     head = [
         query.input_weights,
         *query.input_bounds,
-        np.array(query.goal.center),
+        *([query.reference_input] if layout.resting else []),
+        query.goal_position,
         [query.goal.radius, w.goal, w.goal_steepness, w.obstacle, w.obstacle_steepness],
     ]
     if w.state is not None:

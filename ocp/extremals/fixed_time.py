@@ -76,7 +76,11 @@ def solve_fixed_time(
         raise ValueError(f"terminal_cost: must be a symmetric {n} x {n} matrix, got {P.tolist()}")
     if np.linalg.eigvalsh(P).min() < -1e-12 * max(1.0, abs(P).max()):
         raise ValueError(f"terminal_cost: must be positive semidefinite, got {P.tolist()}")
-    condition = quadratic_condition(query.reference, P)
+    center = query.reference
+    if guess is not None:  # it may end whole turns away
+        last = guess.states[-1]
+        center = last - query.system.difference(last, center)
+    condition = quadratic_condition(center, P)
     guesses = [guess] if guess is not None else default_guesses(query, start, horizon)
     if guess is None:  # along an unstable robot's rough motion the adjoint equation may explode
         guesses.append(replace(guesses[0], costates=0 * guesses[0].states))
@@ -92,7 +96,7 @@ def solve_fixed_time(
             step_tolerance=STEP_TOLERANCE,
         )
         if extremal.trajectory is not None and extremal.hessian is not None:
-            offset = extremal.trajectory.states[-1] - query.reference
+            offset = extremal.trajectory.states[-1] - center
             return FixedTimeMotion(
                 extremal.trajectory,
                 float(offset @ P @ offset),

@@ -54,7 +54,7 @@ def default_guesses(
 
 def _routes(query: Query, start: Array) -> list[Array]:
     """Polylines `[k, d]` from the start to the goal's boundary, round what blocks or through it."""
-    center = np.array(query.goal.center)
+    center = query.goal_position
     first = query.position(start)
     offset = first - center
     distance = float(np.linalg.norm(offset))

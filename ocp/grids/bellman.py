@@ -74,8 +74,12 @@ def bellman_settings(
         cells: how far a step moves, in cells along the axis on which it moves most.
         longest: the longest duration of a step, in seconds (in arc length for time-free queries).
     """
-    head = [cells, longest, query.is_time_free, query.goal.radius]
-    return np.array([*head, *query.goal.center], dtype=float)
+    # An equilibrium ends no step: the goal is then a point that no step comes near.
+    radius = 0.0 if query.is_regulation else query.goal.radius
+    center = (
+        np.full(len(query.system.position), 1e9) if query.is_regulation else query.goal_position
+    )
+    return np.array([cells, longest, query.is_time_free, radius, *center], dtype=float)
 
 
 def bellman_geometry(query: Query, grid: Grid, margin: float = 0.0) -> NDArray[np.float64]:

@@ -2,10 +2,20 @@
 
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 
+from ocp.models.car import car
 from ocp.models.linear import double_integrator, rover, single_integrator, springless_rover
+from ocp.models.robots import ROBOTS, robot_file
 from ocp.models.unicycle import unicycle
 from ocp.system import System
+
+
+def _from_file(path: Path) -> System:
+    from ocp.models.multibody import multibody_system  # Drake takes a second to import
+
+    return multibody_system(path)
+
 
 MODELS: dict[str, Callable[[], System]] = {
     "unicycle": unicycle,
@@ -17,6 +27,8 @@ MODELS: dict[str, Callable[[], System]] = {
     "double-integrator-3d": lambda: double_integrator(3),
     "rover": rover,
     "springless-rover": springless_rover,
+    "car": car,
+    **{name: (lambda name=name: _from_file(robot_file(name))) for name in ROBOTS},
 }
 
 
@@ -32,4 +44,14 @@ def get_model(name: str) -> System:
     return MODELS[name]()
 
 
-__all__ = ["MODELS", "get_model"]
+@cache
+def get_model_file(path: Path) -> System:
+    """The robot of an SDF or URDF file, read once.
+
+    Raises:
+        ValueError: if the file is not a robot that can be read.
+    """
+    return _from_file(path)
+
+
+__all__ = ["MODELS", "get_model", "get_model_file"]

@@ -30,7 +30,14 @@ from ocp.kernels import parameters
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status, Trajectory
 from ocp.transcription.radau import CollocatedMotion, radau
-from ocp.transcription.terms import Structure, clearance, reference, state_cost, symbol
+from ocp.transcription.terms import (
+    Structure,
+    clearance,
+    effort,
+    reference,
+    state_cost,
+    symbol,
+)
 
 Array = NDArray[np.float64]
 
@@ -133,7 +140,8 @@ class Program:
                 constraints.append(k * (h * shares[i - 1] - before_duration * shares[i]))
             before, before_duration = states[:, -1], h
         if not structure.ends_at_goal:
-            total += costs.quadratic_cost(before, reference(structure, q), terminal)
+            period = structure.system.period
+            total += costs.quadratic_cost(before, reference(structure, q), terminal, period)
         x, g = ca.vertcat(*variables), ca.vertcat(*constraints)
         numbers = ca.vertcat(q, shares, margin, offset, price, ca.vec(terminal))
         sizes = {"x": x.numel(), "f": 1, "g": g.numel()}
@@ -177,7 +185,7 @@ class Program:
         for i in range(d):
             x, u = states[:, i], inputs[:, i]
             held.append(slopes[:, i] - h * s.system.dynamics(x, u))
-            run += h * rule.weights[i] * (state_cost(s, x, q) + ca.dot(q[:m], u**2))
+            run += h * rule.weights[i] * (state_cost(s, x, q) + effort(s, u, q))
         place = list(s.system.position)
         if s.ends_at_goal:
             center, radius = q[layout.goal : layout.goal + layout.d], q[layout.goal + layout.d]
@@ -335,7 +343,7 @@ class Program:
             outward = 2 * (self._place(last) - np.array(query.goal.center))
             final[list(s.system.position)] = padded[-1, n * d + d - 1] * outward
         elif problem.terminal is not None:
-            final = 2 * problem.terminal @ (last - query.reference)
+            final = query.terminal_gradient(last, problem.terminal)
         return CollocatedMotion(
             query,
             problem.terminal,

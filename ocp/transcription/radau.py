@@ -117,8 +117,7 @@ class CollocatedMotion:
         """Running plus terminal cost."""
         total = self.cost
         if self.terminal is not None:
-            offset = self.states[-1, -1] - self.query.reference
-            total += float(offset @ self.terminal @ offset)
+            total += self.query.terminal_cost(self.states[-1, -1], self.terminal)
         return total
 
     def at(self, fractions: Array) -> tuple[Array, Array, Array]:

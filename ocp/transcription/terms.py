@@ -68,7 +68,9 @@ def state_cost(structure: Structure, x: ca.SX, q: ca.SX) -> ca.SX:
     total = costs.goal_cost(position, q[layout.goal : at], q[at], q[at + 1], q[at + 2])
     if layout.quadratic:
         M = q[layout.state + n : layout.state + n + n * n].reshape((n, n))
-        total += costs.quadratic_cost(x, reference(structure, q), M)
+        total += costs.quadratic_cost(x, reference(structure, q), M, structure.system.period)
+    if layout.own_cost:
+        total += costs.own_cost(layout.own_cost)(x)
     for i, facets in enumerate(structure.facets):
         k = layout.count + 1 + i * layout.stride
         shape = (q[k + 1], q[at + 3], q[at + 4])
@@ -81,11 +83,21 @@ def state_cost(structure: Structure, x: ca.SX, q: ca.SX) -> ca.SX:
     return total
 
 
+def effort(structure: Structure, u: ca.SX, q: ca.SX) -> ca.SX:
+    """(u - u_g)' R (u - u_g) with the query's numbers as symbols."""
+    m = structure.layout.m
+    moved = u - q[3 * m : 4 * m] if structure.layout.resting else u
+    return ca.dot(q[:m], moved**2)
+
+
 def reference(structure: Structure, q: ca.SX) -> ca.SX:
     """x_g `n x 1` with the query's numbers as symbols."""
-    state = ca.SX.zeros(structure.layout.n, 1)
+    layout = structure.layout
+    if layout.quadratic:
+        return q[layout.state : layout.state + layout.n]
+    state = ca.SX.zeros(layout.n, 1)
     for i, index in enumerate(structure.system.position):
-        state[index] = q[structure.layout.goal + i]
+        state[index] = q[layout.goal + i]
     return state
 
 
