@@ -55,6 +55,8 @@ class Navigation:
         references: `[k, n]`.
         inputs: `[k, m]`.
         latencies: `[k]`, wall-clock seconds of planner and controller in each sample.
+        phases: `[k]`, what the robot was doing.
+        legs: `[k]`, the number of the leg.
         fine_times, track, clearances: `[j]`, `[j, d]`, `[j]` at every integration step.
         reached, collided: what became of it.
         duration: seconds until it arrived, or until the run ended.
@@ -72,6 +74,8 @@ class Navigation:
     references: Array
     inputs: Array
     latencies: Array
+    phases: list[Phase]
+    legs: list[int]
     fine_times: Array
     track: Array
     clearances: Array
@@ -231,6 +235,8 @@ def run(
                 np.array([s.order.reference for s in samples]),
                 np.array([s.input for s in samples]),
                 np.array([s.seconds for s in samples]),
+                [s.order.phase for s in samples],
+                [s.order.leg for s in samples],
                 fine,
                 track[:, number],
                 clearances[:, number],

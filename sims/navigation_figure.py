@@ -126,7 +126,7 @@ def _draw_solid(axes: Axes, solid: Solid, padding: float) -> None:
 
 def _background(axes: Axes, scenario: Scenario, moment: Moment, scale: Normalize) -> None:
     """The tree's cost-to-go, from the nearest nodes along straight lines."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     known = np.isfinite(moment.tree.cost_to_go)
     if not known.any():
@@ -135,7 +135,7 @@ def _background(axes: Axes, scenario: Scenario, moment: Moment, scale: Normalize
     (left, bottom), (right, top) = scenario.lower, scenario.upper
     x, y = np.linspace(left, right, GRID), np.linspace(bottom, top, GRID)
     places = np.stack(np.meshgrid(x, y), axis=-1)
-    near: Any = cKDTree(points)
+    near: Any = KDTree(points)
     away, index = near.query(places, k=min(6, len(points)))
     value = (away + costs[index]).min(axis=-1)
     axes.pcolormesh(
@@ -233,7 +233,7 @@ def _animate(scenario: Scenario, runs: list[Navigation], path: Path) -> None:
     scale = _cost_scale(run.moments)
     period = run.moments[1].time - run.moments[0].time if len(run.moments) > 1 else 1.0
     figure, axes = plt.subplots(figsize=(6, 6), layout="constrained")
-    writer = PillowWriter(fps=1.0 / (GIF_EVERY * period))
+    writer = PillowWriter(fps=round(1.0 / (GIF_EVERY * period)))
     with atomic_path(path) as temporary, writer.saving(figure, temporary, 80):
         for moment in moments:
             axes.clear()

@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ class Visitor:
     vanishes: float
     velocity: Array
 
-    @property
+    @cached_property
     def moves(self) -> bool:
         return bool(np.any(self.velocity != 0))
 
