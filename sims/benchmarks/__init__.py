@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 BENCHMARKS: dict[str, str] = {
+    "deadlines": "how late plans are ready against their deadline, over 10,000 calls",
     "exact": "exact costs, closed form, success and time of exact trajectories",
     "execution": "speed-up of two workers, what Dask adds a task, worker deaths survived",
     "grids": "eikonal and set-valued grids: time, value error, closed-loop excess",
