@@ -256,11 +256,12 @@ class Query:
 
     def terminal_cost(self, state: ArrayLike, matrix: ArrayLike) -> float:
         """(x - x_g)' P (x - x_g), periodic where the robot is, at `state` `[n]`; P `[n, n]`."""
-        return float(self._terminal(state, matrix)[0])
+        return float(self._terminal(np.asarray(state, float), np.asarray(matrix, float))[0])
 
     def terminal_gradient(self, state: ArrayLike, matrix: ArrayLike) -> NDArray[np.float64]:
         """Its gradient `[n]`."""
-        return np.array(self._terminal(state, matrix)[1])[:, 0]
+        gradient = self._terminal(np.asarray(state, float), np.asarray(matrix, float))[1]
+        return np.array(gradient)[:, 0]
 
     @cached_property
     def _terminal(self) -> ca.Function:

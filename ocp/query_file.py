@@ -63,20 +63,20 @@ def query_to_dict(query: Query) -> dict[str, Any]:
         raise ValueError(f"model: {query.model.name!r} is not a registered name, no file holds it")
     if query.cost.own:
         raise ValueError("cost.own: a function of one's own, no file holds it")
-    regulation = isinstance(query.goal, Equilibrium)
-    place = {"state": list(query.goal.state)} if regulation else {"center": list(query.goal.center)}
+    if isinstance(query.goal, Equilibrium):
+        place, defaults = {"state": list(query.goal.state)}, {"goal": 0.0}
+    else:
+        place, defaults = {"center": list(query.goal.center)}, {}
     table: dict[str, Any] = {
         "model": query.model.name if isinstance(query.model, ModelFile) else query.model,
         "goal": {**place, "radius": query.goal.radius},
     }
     if query.obstacles:
         table["obstacle"] = [_obstacle_table(o) for o in query.obstacles]
-    defaults = {"goal": 0.0} if regulation else {}
     weights = {
         f.name: _plain(value)
         for f in fields(RunningCost)
-        if (value := getattr(query.cost, f.name))
-        != (0.0 if regulation and f.name == "goal" else f.default)
+        if (value := getattr(query.cost, f.name)) != defaults.get(f.name, f.default)
     }
     if weights:
         table["cost"] = weights

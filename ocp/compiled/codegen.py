@@ -107,6 +107,9 @@ def interpreted(function: ca.Function, inputs: Sequence[str], outputs: Sequence[
     Compiling ten thousand statements takes numba a minute, a loop a second; the loop runs a few
     times slower. The lines are the body of a function of a module that imports numpy as `np`; the
     table is the line that begins with `TABLE`, for the module's top level.
+
+    Raises:
+        ValueError: if the graph holds an operation that has no translation.
     """
     rows, constants, used = [], [], []
     first_in = np.cumsum([0, *(function.nnz_in(i) for i in range(function.n_in()))])
@@ -140,7 +143,8 @@ def interpreted(function: ca.Function, inputs: Sequence[str], outputs: Sequence[
     ]
     for i, template in enumerate(inputs):
         lines += [
-            f"given[{first_in[i] + j}] = {template.format(j)}" for j in range(function.nnz_in(i))
+            f"for j in range({function.nnz_in(i)}):",
+            f"    given[{first_in[i]} + j] = {template.format('j')}",
         ]
     lines += [
         f"for k in range({len(rows)}):",
@@ -154,6 +158,7 @@ def interpreted(function: ca.Function, inputs: Sequence[str], outputs: Sequence[
         lines += [f"    {'if' if i == 0 else 'elif'} o == {i}:", f"        {case}"]
     for i, template in enumerate(outputs):
         lines += [
-            f"{template.format(j)} = found[{first_out[i] + j}]" for j in range(function.nnz_out(i))
+            f"for j in range({function.nnz_out(i)}):",
+            f"    {template.format('j')} = found[{first_out[i]} + j]",
         ]
     return lines

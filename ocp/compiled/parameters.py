@@ -55,7 +55,7 @@ class Layout:
             query.cost.state is not None,
             query.is_bounded,
             query.is_regulation,
-            query.cost.own,
+            str(query.cost.own),
         )
 
 

@@ -318,7 +318,7 @@ class Program:
         rows = np.zeros((len(costates), self._stride))
         rows[:, : n * d] = (-costates * radau(d).weights[:, None]).reshape(len(costates), -1)
         if self.structure.ends_at_goal:
-            outward = 2 * (self._place(end) - np.array(problem.query.goal.center))
+            outward = 2 * (self._place(end) - problem.query.goal_position)
             push = self._place(costates[-1, -1]) @ outward
             rows[-1, n * d + d - 1] = push / (outward @ outward)
         return np.delete(rows.ravel(), self._stride - 1)
@@ -340,7 +340,7 @@ class Program:
         last = states[-1, -1]
         final = np.zeros(n)
         if s.ends_at_goal:
-            outward = 2 * (self._place(last) - np.array(query.goal.center))
+            outward = 2 * (self._place(last) - query.goal_position)
             final[list(s.system.position)] = padded[-1, n * d + d - 1] * outward
         elif problem.terminal is not None:
             final = query.terminal_gradient(last, problem.terminal)
