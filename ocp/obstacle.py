@@ -46,7 +46,11 @@ class Obstacle:
 
     @classmethod
     def diamond(cls, center: ArrayLike, radius: float, hard: bool = False) -> "Obstacle":
-        """The ball of the 1-norm: a square standing on a corner, `radius` from centre to corner."""
+        """The ball of the 1-norm: a square standing on a corner, `radius` from centre to corner.
+
+        Raises:
+            ValueError: if the centre is not a point of the plane, or the radius not positive.
+        """
         c, r = _point(center), _positive(radius)
         if len(c) != 2:
             raise ValueError(f"center: a diamond lives in the plane, got {len(c)} coordinates")
@@ -55,7 +59,11 @@ class Obstacle:
 
     @classmethod
     def polygon(cls, vertices: ArrayLike, hard: bool = False) -> "Obstacle":
-        """The convex polygon with these `[k, 2]` vertices, in order, either way round."""
+        """The convex polygon with these `[k, 2]` vertices, in order, either way round.
+
+        Raises:
+            ValueError: if the vertices are too few or many, not finite, or not strictly convex.
+        """
         corners = np.asarray(vertices, dtype=float)
         if corners.ndim != 2 or corners.shape[1] != 2 or not 3 <= len(corners) <= MAX_FACETS:
             raise ValueError(

@@ -42,21 +42,33 @@ class Until:
 
 
 def deadline(seconds: float) -> Until:
-    """Stop rather than begin a refinement that would end more than `seconds` after the query."""
+    """Stop rather than begin a refinement that would end more than `seconds` after the query.
+
+    Raises:
+        ValueError: if `seconds` is not positive.
+    """
     if not seconds > 0:
         raise ValueError(f"deadline: must be a positive number of seconds, got {seconds}")
     return Until(lambda p: p.seconds >= seconds)
 
 
 def iterations(count: int) -> Until:
-    """Stop after `count` refinements."""
+    """Stop after `count` refinements.
+
+    Raises:
+        ValueError: if `count` is negative.
+    """
     if count < 0:
         raise ValueError(f"iterations: must not be negative, got {count}")
     return Until(lambda p: p.iterations >= count)
 
 
 def trajectories(count: int) -> Until:
-    """Stop once the planner has used `count` exact trajectories."""
+    """Stop once the planner has used `count` exact trajectories.
+
+    Raises:
+        ValueError: if `count` is negative.
+    """
     if count < 0:
         raise ValueError(f"trajectories: must not be negative, got {count}")
     return Until(lambda p: p.trajectories >= count)
@@ -89,7 +101,7 @@ class Planner(Protocol):
     """
 
     def start(self, query: Query, starts: Sequence[NDArray[np.float64]]) -> Any:
-        """The first state. `starts` are the states that matter; none means the whole space."""
+        """The first state. `starts` `[n]` are those that matter; none means the whole space."""
         ...
 
     def refine(self, state: Any) -> Any:
@@ -163,6 +175,8 @@ def plan(
     until: Until | None = None,
 ) -> Plan:
     """Run `planner` on `query` until the rule holds or nothing more is to be gained.
+
+    `starts` are states `[n]` that matter most; with none, all do.
 
     Raises:
         ValueError: if a start does not fit the query.

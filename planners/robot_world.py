@@ -168,7 +168,7 @@ class RobotWorld:
         del self._solids[handle], self._pairs[handle]
 
     def move(self, handle: int, translation: ArrayLike, rotation: ArrayLike | float = 0.0) -> None:
-        """Move an obstacle by `translation`, turning it about its centre.
+        """Move an obstacle by `translation` `[3]`, turning it about its centre.
 
         Raises:
             ValueError: if there is none with this handle, or for numbers that make no motion.

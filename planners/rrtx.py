@@ -336,7 +336,7 @@ class RRTX:
         return self._repair([Cause.SETTLING], [], [], True, begun)
 
     def set_goal(self, goal: ArrayLike, to_the_end: bool = False) -> Update:
-        """Root the tree at a new goal; the graph and its clearances stay."""
+        """Root the tree at a new goal `[d]`; the graph and its clearances stay."""
         begun = time.perf_counter()
         point = checked_point(self.world, goal, "goal")
         same = np.flatnonzero((self._roadmap.points == point).all(axis=1))
@@ -356,6 +356,9 @@ class RRTX:
 
         The least over the `candidates` most promising nodes within the connection radius whose
         line is certified free; infinite where there is none (inside padded obstacles, or cut off).
+
+        Raises:
+            ValueError: if a point is not finite or has the wrong number of coordinates.
         """
         array = np.asarray(points, dtype=float)
         d = self.world.dimension

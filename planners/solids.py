@@ -69,7 +69,11 @@ class Solid:
 
     @classmethod
     def box(cls, lower: ArrayLike, upper: ArrayLike) -> "Solid":
-        """The box (a rectangle in the plane) between two corners `[d]`."""
+        """The box (a rectangle in the plane) between two corners `[d]`.
+
+        Raises:
+            ValueError: if the corners do not fit each other, or leave no interior.
+        """
         a, b = _point(lower, "lower"), _point(upper, "upper")
         if a.shape != b.shape:
             raise ValueError(f"upper: must have {len(a)} coordinates like lower, got {len(b)}")
@@ -84,7 +88,11 @@ class Solid:
 
     @classmethod
     def hull(cls, points: ArrayLike) -> "Solid":
-        """The convex hull of `[k, d]` points, which must span the plane or space."""
+        """The convex hull of `[k, d]` points, which must span the plane or space.
+
+        Raises:
+            ValueError: if the points span no interior.
+        """
         from scipy.spatial import ConvexHull, QhullError
 
         cloud = np.asarray(points, dtype=float)
@@ -109,7 +117,11 @@ class Solid:
 
     @classmethod
     def of(cls, obstacle: "Obstacle | Solid") -> "Solid":
-        """The solid of a query's obstacle (a circle, diamond or polygon); a solid is kept."""
+        """The solid of a query's obstacle (a circle, diamond or polygon); a solid is kept.
+
+        Raises:
+            ValueError: if it is neither.
+        """
         if isinstance(obstacle, Solid):
             return obstacle
         if not isinstance(obstacle, Obstacle):
@@ -124,6 +136,9 @@ class Solid:
         Args:
             translation: metres.
             rotation: an angle in the plane (radians), a `[3, 3]` rotation matrix in space.
+
+        Raises:
+            ValueError: if the translation has the wrong number of coordinates.
         """
         shift = _point(translation, "translation")
         if len(shift) != self.dimension:

@@ -111,7 +111,7 @@ class World(Protocol):
         ...
 
     def move(self, handle: int, translation: ArrayLike, rotation: ArrayLike | float = 0.0) -> None:
-        """Move an obstacle, turning it about its centre."""
+        """Move an obstacle by `translation` `[d]`, turning it about its centre."""
         ...
 
 
@@ -224,7 +224,11 @@ class SceneWorld:
         self._solids = {h: self._solids[h] for h in order}
 
     def distances(self, points: ArrayLike, within: float = np.inf) -> Nearest:
-        """Distance and gradient at `points` `[..., d]`, looking no farther than `within` metres."""
+        """Distance and gradient at `points` `[..., d]`, looking no farther than `within` metres.
+
+        Raises:
+            ValueError: if a point is not finite or does not fit the world, or `within` is negative.
+        """
         array = np.asarray(points, dtype=float)
         if array.shape[-1:] != (self.dimension,):
             raise ValueError(
@@ -424,7 +428,11 @@ def drake_shape(solid: Solid, height: float | None = None) -> Any:
 def checked_box(
     lower: ArrayLike, upper: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The corners of a box with an interior, as arrays."""
+    """The corners `[d]` of a box with an interior, as arrays.
+
+    Raises:
+        ValueError: if they do not fit each other, or leave no interior.
+    """
     a, b = np.array(lower, dtype=float), np.array(upper, dtype=float)
     if a.ndim != 1 or a.shape != b.shape or not 2 <= len(a) <= 7:
         raise ValueError(
@@ -450,14 +458,22 @@ def _distance(answer: Any) -> float:
 
 
 def checked_padding(padding: float) -> float:
-    """The padding, if it is a finite number of at least 0."""
+    """The padding, if it is a finite number of at least 0.
+
+    Raises:
+        ValueError: if it is not.
+    """
     if not (np.isfinite(padding) and padding >= 0):
         raise ValueError(f"padding: must be a finite number of at least 0, got {padding}")
     return float(padding)
 
 
 def checked_point(world: World, point: ArrayLike, name: str) -> NDArray[np.float64]:
-    """The point `[d]`, if it lies in the world's box."""
+    """The point `[d]`, if it lies in the world's box.
+
+    Raises:
+        ValueError: if it does not.
+    """
     array = np.array(point, dtype=float)
     if array.shape != (world.dimension,):
         raise ValueError(f"{name}: must be {world.dimension} coordinates, got {array.tolist()}")

@@ -96,7 +96,7 @@ def rollout(policy: Policy, start: ArrayLike, settings: LoopSettings | None = No
 def rollouts(
     policy: Policy, starts: Sequence[ArrayLike], settings: LoopSettings | None = None
 ) -> list[Rollout]:
-    """Closed loops from many starts, all advanced together by compiled Runge-Kutta steps.
+    """Closed loops from many starts `[n]`, all advanced together by compiled Runge-Kutta steps.
 
     Raises:
         ValueError: if a start does not fit the policy's query.
@@ -242,7 +242,7 @@ def drake_rollout(
     settings: LoopSettings | None = None,
     accuracy: float = 1e-8,
 ) -> Rollout:
-    """The closed loop in a Drake Diagram, integrated with error control to `accuracy`.
+    """The closed loop from `start` `[n]` in a Drake Diagram, integrated with error control to `accuracy`.
 
     The goal's first hit is located on the cubic through the last two steps of the integrator.
 

@@ -274,6 +274,9 @@ def regulated_costs(
     Returns:
         costs `[s]` (without one half, terminal cost included; infinite where the motion blew up),
         times `[k]` and states `[s, k, n]`.
+
+    Raises:
+        ValueError: if `hold` does not divide the horizon.
     """
     initial = np.ascontiguousarray(np.atleast_2d(np.asarray(starts, dtype=float)))
     block = hold if hold is not None else cost.horizon

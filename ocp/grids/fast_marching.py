@@ -92,7 +92,11 @@ def marched(
     relaxation: float | None = None,
     seed: bool = True,
 ) -> Marched:
-    """As `march`, with the order in which nodes were accepted."""
+    """As `march`, with the order in which nodes were accepted.
+
+    Raises:
+        SolveError, ValueError: as `march`.
+    """
     _check(query, grid, order, relaxation)
     problem = _Problem(query, grid, _relaxation(grid) if relaxation is None else relaxation)
     if seed and has_goal_table(query, problem.reach):

@@ -195,6 +195,9 @@ def blocked_moves(query: Query, grid: Grid, moves: NDArray[np.int64]) -> NDArray
     Returns:
         `[*position shape]` bit masks: bit k is set if the straight segment from that position to
         the one `moves[k]` away is not clear. All are set inside an obstacle.
+
+    Raises:
+        ValueError: if there are more moves than fit a bit mask.
     """
     d = len(query.system.position)
     shape = grid.shape[:d]

@@ -40,6 +40,9 @@ def judge(motion: CollocatedMotion, ends_at_goal: bool) -> ReplayVerdict:
     """Replay a motion interval by interval.
 
     A gap in an interval's end state changes the remaining cost by costate times gap.
+
+    Raises:
+        SolveError: NOT_CONVERGED if the replay does not.
     """
     query = motion.query
     samples = 64 if query.hard_obstacles else 8
