@@ -50,7 +50,7 @@ def reproduce(name: str, setting: Setting) -> dict[str, Any]:
     module = experiment(name)
     begun = time.perf_counter()
     common = {"seed": setting.seed, "quick": setting.quick}
-    findings = module.run(setting, Parts(setting.out / "parts" / name, common))
+    findings = module.run(setting, Parts(setting.out / "parts", common))
     document = {
         "experiment": name,
         "quick": setting.quick,

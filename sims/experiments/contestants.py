@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ocp.planning import Answer, OneShot, Planner, Until, trajectories
 from ocp.query import Query
+from sims.closed_loop import LoopSettings
 from sims.methods import METHODS
 
 
@@ -19,7 +20,8 @@ class Contestant:
     Attributes:
         key: names it in files.
         label: names its row.
-        method: the name of the method in `sims.methods.METHODS`; absent where that is.
+        method: the name of the method in `sims.methods.METHODS`; absent where that is. Empty for
+            one that has no name there.
         planner: makes it.
         until: when it stops; by default when it has nothing left to refine.
         row: of the paper's Table I, if it is one.
@@ -41,12 +43,14 @@ class Contestant:
     @property
     def held(self) -> float:
         """Seconds for which its inputs are held."""
-        return METHODS[self.method].period if self.period is None else self.period
+        if self.period is not None:
+            return self.period
+        return METHODS[self.method].period if self.method else LoopSettings().period
 
     @property
     def absent(self) -> str | None:
         """Why it cannot be run, or `None` if it can."""
-        if self.method not in METHODS:
+        if self.method and self.method not in METHODS:
             return f"{self.method} is not implemented"
         try:
             self.planner()
@@ -93,6 +97,19 @@ def _refmm(simplices: int) -> Callable[[], Planner]:
         from ocp.refmm import Refmm, RefmmSettings
 
         return Refmm(RefmmSettings(last=simplices))
+
+    return make
+
+
+def _eikonal(nodes: int) -> Callable[[], Planner]:
+    def make() -> Planner:
+        from ocp.eikonal import solve_eikonal
+
+        def solve(query: Query, _starts: Sequence[NDArray[np.float64]]) -> Answer:
+            solution = solve_eikonal(query, nodes=nodes)
+            return solution.policy(), solution.value
+
+        return OneShot(solve)
 
     return make
 
@@ -185,7 +202,7 @@ CONTESTANTS = (
     Contestant(
         "faithful",
         "Anytime adaptation",
-        "faithful",
+        "",
         _faithful,
         EIGHT,
         "Anytime adaptation",
@@ -203,7 +220,7 @@ CONTESTANTS = (
         "eikonal",
         "eikonal (ours)",
         "eikonal",
-        _registered("eikonal"),
+        _eikonal(60_000),
         NEVER,
         note="fast marching, 60,000 nodes; interpolated lookahead",
     ),

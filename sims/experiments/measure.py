@@ -14,6 +14,7 @@ from ocp.query_family import PAPER_START, paper_query
 from ocp.trajectory import SolveError, Trajectory
 from sims.closed_loop import LoopSettings, Rollout, rollouts
 from sims.experiments.contestants import Contestant
+from sims.experiments.paper import GOALS
 from sims.experiments.parts import Parts
 
 Start = Sequence[float]
@@ -86,7 +87,7 @@ def judged(
         answer, cpu = planned(contestant, query, starts)
         settings = LoopSettings(period=contestant.held)
         loops = rollouts(answer.policy, [np.array(s) for s in starts], settings)
-    except SolveError as error:
+    except (SolveError, FloatingPointError) as error:
         return {"seconds": None, "cpu_seconds": None, "loops": None, "failure": str(error)}
     return {
         "seconds": answer.reaction_time,
@@ -94,6 +95,55 @@ def judged(
         "loops": [loop_report(loop, with_path) for loop in loops],
         "failure": None,
     }
+
+
+def on_the_four_queries(
+    contestant: Contestant, parts: Parts, skip: str | None = None
+) -> dict[str, Any]:
+    """A row of Tables I and II: costs and times from the paper's start, a query each.
+
+    The plans are parts that both tables share.
+    """
+    absent = contestant.absent or skip
+    row: dict[str, Any] = {
+        "key": contestant.key,
+        "label": contestant.label,
+        "paper_row": contestant.row,
+        "note": contestant.note,
+        "absent": absent,
+        "costs": [None] * len(GOALS),
+        "seconds": [None] * len(GOALS),
+        "cpu_seconds": [None] * len(GOALS),
+        "failures": [],
+    }
+    if absent is not None:
+        return row
+    warm = False
+
+    def measured(goal: tuple[float, float]) -> dict[str, Any]:
+        nonlocal warm
+        if not (warm or contestant.slow):
+            rehearse(contestant)
+            warm = True
+        return judged(contestant, paper_query(goal), [PAPER_START])
+
+    for k, goal in enumerate(GOALS):
+        name = "plan-{}-{:g}-{:g}".format(contestant.key, *goal)
+        answer = parts.get(name, contestant.config, lambda goal=goal: measured(goal))
+        if answer["loops"] is None:
+            row["failures"].append(answer["failure"])
+            continue
+        row["costs"][k] = answer["loops"][0]["cost"]
+        row["seconds"][k], row["cpu_seconds"][k] = answer["seconds"], answer["cpu_seconds"]
+    return row
+
+
+def optima_of_the_four_queries(parts: Parts) -> list[float | None]:
+    """Exact optimal costs from the paper's start."""
+    return [
+        truth(parts, paper_query(goal), PAPER_START, "truth-{:g}-{:g}".format(*goal))["cost"]
+        for goal in GOALS
+    ]
 
 
 def excesses(costs: Sequence[float | None], optima: Sequence[float | None]) -> NDArray[np.float64]:

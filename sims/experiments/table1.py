@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from ocp.query_family import PAPER_START, paper_query
 from sims.experiments import Entry, Findings, Setting
-from sims.experiments.contestants import CONTESTANTS
-from sims.experiments.measure import judged, rehearse, truth
+from sims.experiments.contestants import CONTESTANTS, Contestant
+from sims.experiments.measure import on_the_four_queries, optima_of_the_four_queries
 from sims.experiments.paper import BENCHMARK, GOALS, TABLE_I, mean_excess
 from sims.experiments.parts import Parts
 from sims.experiments.sheet import ABSENT, Sheet, number, percent
@@ -16,44 +15,15 @@ from sims.experiments.sheet import ABSENT, Sheet, number, percent
 
 def run(setting: Setting, parts: Parts) -> Findings:
     """Every contestant on the four queries."""
-    optima = [
-        truth(parts, paper_query(goal), PAPER_START, "truth-{:g}-{:g}".format(*goal))["cost"]
-        for goal in GOALS
-    ]
-    rows = []
-    for contestant in CONTESTANTS:
-        skipped = "left out of quick runs" if setting.quick and contestant.slow else None
-        why = contestant.absent or skipped
-        row: dict[str, Any] = {
-            "key": contestant.key,
-            "label": contestant.label,
-            "paper_row": contestant.row,
-            "note": contestant.note,
-            "absent": why,
-            "costs": [None] * len(GOALS),
-            "failures": [],
-        }
-        rows.append(row)
-        if why is not None:
-            continue
-        warm = False
-        for k, goal in enumerate(GOALS):
-
-            def measured(goal=goal, contestant=contestant) -> dict[str, Any]:
-                nonlocal warm
-                if not warm:
-                    rehearse(contestant)
-                    warm = True
-                return judged(contestant, paper_query(goal), [PAPER_START])
-
-            name = "{}-{:g}-{:g}".format(contestant.key, *goal)
-            answer = parts.get(name, contestant.config, measured)
-            if answer["loops"] is None:
-                row["failures"].append(answer["failure"])
-            else:
-                row["costs"][k] = answer["loops"][0]["cost"]
+    optima = optima_of_the_four_queries(parts)
+    rows = [on_the_four_queries(c, parts, skipped(c, setting)) for c in CONTESTANTS]
     document = {"goals": [list(g) for g in GOALS], "optima": optima, "rows": rows}
     return Findings(document, {"table1": sheet(document)})
+
+
+def skipped(contestant: Contestant, setting: Setting) -> str | None:
+    """Why a contestant is not run in this setting."""
+    return "left out of quick runs" if setting.quick and contestant.slow else None
 
 
 def sheet(document: dict[str, Any]) -> Sheet:
