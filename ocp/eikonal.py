@@ -140,6 +140,12 @@ def solve_eikonal(
             if nothing outside the goal reaches it.
         ValueError: if the grid does not fit.
     """
+    if query.is_regulation:
+        raise SolveError(
+            Status.NOT_APPLICABLE,
+            "no front starts from an equilibrium, where V is no distance; the methods exact and "
+            "value-iteration apply",
+        )
     scheme = scheme or default_scheme(query)
     if scheme is not Scheme.VALUE_ITERATION and not query.is_time_free:
         raise SolveError(

@@ -15,11 +15,14 @@ from ocp.collocation import solve_collocation
 from ocp.extremals.extremal import find_extremal
 from ocp.pontryagin import exact_trajectory
 from ocp.query import Query
+from ocp.riccati import LinearQuadratic, algebraic_riccati
 from ocp.trajectory import SolveError, Status, Trajectory
 
 TRUTH_TOLERANCE = 1e-4
-METHODS = ("closed form", "PMP", "collocation", "collocation from PMP")
-"""Collocation is asked twice: from its own guesses, and from the motion that PMP found."""
+METHODS = ("closed form", "PMP", "collocation", "collocation from PMP", "Riccati", "grid")
+"""Collocation is asked twice: from its own guesses, and from the motion that PMP found. Where the
+goal is an equilibrium, PMP starts from collocation's answer, Riccati answers for linear robots, and
+the grid, which is a few per cent off, where it is asked for and the dimension allows."""
 
 
 @dataclass(frozen=True)
@@ -117,13 +120,20 @@ class Verdict:
         )
 
 
-def consult(query: Query, state: ArrayLike) -> Verdict:
+def consult(query: Query, state: ArrayLike, with_grid: bool = False) -> Verdict:
     """Ask every exact method that applies about V at `state` `[n]`.
+
+    Args:
+        query: the query.
+        state: in the domain, outside hard obstacles.
+        with_grid: ask value iteration too, where the goal is an equilibrium.
 
     Raises:
         ValueError: if the state does not fit the query.
     """
     start = query.check_start(state)
+    if query.is_regulation:
+        return Verdict(start, _of_regulation(query, start, with_grid))
     answers: dict[str, Answer] = {}
     try:
         answers["closed form"] = Answer(straight_value(query, start), None)
@@ -137,6 +147,31 @@ def consult(query: Query, state: ArrayLike) -> Verdict:
             lambda: solve_collocation(query, start, guess=guess)
         )
     return Verdict(start, answers)
+
+
+def _of_regulation(query: Query, start: NDArray[np.float64], with_grid: bool) -> dict[str, Answer]:
+    """The answers where the goal is an equilibrium."""
+    from ocp.regulation import pmp_regulation, solve_regulation
+
+    answers: dict[str, Answer] = {}
+    try:
+        problem = LinearQuadratic.of_query(query)
+        answers["Riccati"] = Answer(float(algebraic_riccati(problem).value(start)), None)
+    except SolveError as error:
+        answers["Riccati"] = _failed(error)
+    answers["collocation"] = _answer(lambda: solve_regulation(query, start))
+    direct = answers["collocation"].motion
+    if direct is not None:
+        answers["PMP"] = _answer(lambda: pmp_regulation(query, direct))
+    if with_grid:
+        from ocp.grids.regulation_grid import solve_regulation_grid
+
+        try:
+            value = float(solve_regulation_grid(query).value(start))
+            answers["grid"] = Answer(value, None)
+        except SolveError as error:
+            answers["grid"] = _failed(error)
+    return answers
 
 
 def _extremal(query: Query, start: NDArray[np.float64]) -> Trajectory:

@@ -44,8 +44,18 @@ class Rollout:
 
     @property
     def cost(self) -> float | None:
-        """Running cost up to the first hit; `None` if the goal was not reached."""
-        return self.trajectory.cost if self.reached else None
+        """Running cost up to the first hit; `None` if the goal was not reached.
+
+        Where the goal is an equilibrium, the linear regulator's cost from there on is added.
+        """
+        if not self.reached:
+            return None
+        after = 0.0
+        if self.query.is_regulation:
+            from ocp.regulation import RegulatorValue
+
+            after = float(RegulatorValue(self.query).value(self.trajectory.states[-1]))
+        return self.trajectory.cost + after
 
     @property
     def collided(self) -> bool:
@@ -108,8 +118,7 @@ def rollouts(
     count, substeps = len(states), settings.substeps
     steps = round(settings.time_limit / settings.period)
     step = settings.period / substeps
-    goal = np.array([*query.goal.center, query.goal.radius + GOAL_TOLERANCE])
-    position = np.array(system.position)
+    position, goal = _goal_region(query)
     rows = np.zeros((count, system.n + 1))
     rows[:, :-1] = states
     active = np.flatnonzero(query.goal_distance(states) > GOAL_TOLERANCE)
@@ -143,6 +152,14 @@ def rollouts(
             rows[index] = path[i, last]
         active = active[query.goal_distance(rows[active, :-1]) > GOAL_TOLERANCE * (1 + 1e-9)]
     return [_assemble(query, start, piece) for start, piece in zip(states, pieces, strict=True)]
+
+
+def _goal_region(query: Query) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """The coordinates `[d]` in which the goal's region lies; its centre, radius and periods."""
+    system = query.system
+    where = np.array(range(system.n) if query.is_regulation else system.position)
+    radius = query.goal.radius + GOAL_TOLERANCE
+    return where, np.concatenate([query.reference[where], [radius], system.period[where]])
 
 
 def _assemble(query: Query, start: NDArray, pieces: list) -> Rollout:
@@ -190,7 +207,7 @@ def _judged(query: Query, trajectory: Trajectory) -> Rollout:
 def _advance(dynamics, cost, parameter, inputs, goal, position, step, path, elapsed, length):
     """Advance each row of `path` by one period under its held input, to the goal's first hit.
 
-    A Runge-Kutta step that ends inside the goal ball is repeated with its length bisected until it
+    A Runge-Kutta step that ends inside the goal's region is repeated, its length bisected until it
     ends on the boundary.
     """
     width = path.shape[2]
@@ -217,10 +234,13 @@ def _advance(dynamics, cost, parameter, inputs, goal, position, step, path, elap
                 for i in range(width):
                     slope = rates[0, i] + 2.0 * (rates[1, i] + rates[2, i]) + rates[3, i]
                     trial[i] = path[row, k, i] + h / 6.0 * slope
-                distance = 0.0
-                for i in range(position.shape[0]):
-                    distance += (trial[position[i]] - goal[i]) ** 2
-                inside = distance <= goal[position.shape[0]] ** 2
+                distance, d = 0.0, position.shape[0]
+                for i in range(d):
+                    gap, period = trial[position[i]] - goal[i], goal[d + 1 + i]
+                    if period > 0.0:
+                        gap -= period * np.round(gap / period)
+                    distance += gap**2
+                inside = distance <= goal[d] ** 2
                 if inside:
                     hit = True
                     high = h
@@ -242,7 +262,7 @@ def drake_rollout(
     settings: LoopSettings | None = None,
     accuracy: float = 1e-8,
 ) -> Rollout:
-    """The closed loop from `start` `[n]` in a Drake Diagram, integrated with error control to `accuracy`.
+    """The closed loop from `start` `[n]` in a Drake Diagram, its error controlled to `accuracy`.
 
     The goal's first hit is located on the cubic through the last two steps of the integrator.
 

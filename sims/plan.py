@@ -121,6 +121,10 @@ def run(command: "cli.Plan") -> int:
         if not command.start:
             raise ValueError("start: give at least one, --start X1 X2 ...")
         starts = [query.check_start(s) for s in command.start]
+        if query.is_regulation:
+            from ocp.regulation import regulator
+
+            regulator(query)  # whether the equilibrium can be stabilised at all
         if command.deadline is not None and not 0 < command.deadline < np.inf:
             raise ValueError(f"deadline: must be a positive number, got {command.deadline}")
         if command.trajectories is not None and command.trajectories < 1:

@@ -46,6 +46,7 @@ def iterate_values(
     upper_bound: NDArray[np.float64] | None = None,
     tolerance: float = TOLERANCE,
     max_sweeps: int = MAX_SWEEPS,
+    held: NDArray[np.float64] | None = None,
 ) -> FixedPoint:
     """The value of any query on a grid.
 
@@ -56,6 +57,8 @@ def iterate_values(
             is known).
         tolerance: changes smaller than this are not passed on.
         max_sweeps: give up after so many; the result then says so.
+        held: `[*grid.shape]`, values that do not change where they are finite; they take the place
+            of 0 in the goal.
 
     Raises:
         ValueError: if the grid does not fit the query.
@@ -63,8 +66,14 @@ def iterate_values(
     if grid.dimension != query.system.n:
         raise ValueError(f"grid: {query.system.name} has {query.system.n} states, got {grid.shape}")
     nodes = grid.nodes().reshape(-1, grid.dimension)
-    fixed = query.goal_distance(nodes) <= 0
-    values = np.where(fixed, 0.0, np.inf)
+    if held is None:
+        fixed = query.goal_distance(nodes) <= 0
+        values = np.where(fixed, 0.0, np.inf)
+    else:
+        if held.shape != grid.shape:
+            raise ValueError(f"held: needs shape {grid.shape}, got {held.shape}")
+        fixed = np.isfinite(held).ravel()
+        values = held.ravel().copy()
     if upper_bound is not None:
         if upper_bound.shape != grid.shape:
             raise ValueError(f"upper_bound: needs shape {grid.shape}, got {upper_bound.shape}")

@@ -1,0 +1,44 @@
+"""The value of regulation to an equilibrium on a grid, by value iteration."""
+
+import numpy as np
+
+from ocp.grid import Grid, GridValue
+from ocp.grids.value_iteration import iterate_values
+from ocp.query import Query
+from ocp.regulation import RegulatorValue
+from ocp.trajectory import SolveError, Status
+
+MAX_STATES = 4
+NODES = {1: 400, 2: 20_000, 3: 100_000, 4: 400_000}
+HELD_CELLS = 2.0  # from the equilibrium, where the linear regulator's value is held
+
+
+def solve_regulation_grid(query: Query, grid: Grid | None = None) -> GridValue:
+    """V on a grid; the regulator's x'P x holds next to the equilibrium.
+
+    The grid's box constrains the motion: near its faces V is too large.
+
+    Args:
+        query: with an `Equilibrium` as its goal, of a robot with at most 4 states.
+        grid: by default one of the size that its dimension allows.
+
+    Raises:
+        SolveError: NOT_APPLICABLE, with what a grid would need; NOT_CONVERGED.
+        ValueError: if the equilibrium cannot be stabilised.
+    """
+    system = query.system
+    if not query.is_regulation:
+        raise SolveError(Status.NOT_APPLICABLE, "value iteration: the goal is no equilibrium")
+    if system.n > MAX_STATES:
+        nodes = 40**system.n
+        raise SolveError(
+            Status.NOT_APPLICABLE,
+            f"value iteration: {system.name} has {system.n} states; 40 nodes an axis are "
+            f"{nodes:.1e} nodes, {nodes * 8 / 1e9:.1e} GB",
+        )
+    grid = grid or Grid.for_query(query, NODES[system.n])
+    nodes = grid.nodes()
+    cells = np.abs(system.difference(nodes, query.reference)) / grid.spacing
+    near = (cells <= HELD_CELLS).all(axis=-1)
+    held = np.where(near, RegulatorValue(query).value(nodes), np.inf)
+    return GridValue(grid, iterate_values(query, grid, held=held).checked().values)
