@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.planning import Answer, OneShot, Planner
-from ocp.query import Query
+from ocp.query import Equilibrium, Query
 from ocp.query_family import sample_start
 from ocp.trajectory import SolveError
 from ocp.value import greedy
@@ -46,11 +46,15 @@ class Method:
         The goal is moved, so that nothing of the query itself is solved.
         """
         system = query.system
-        center = np.array(query.goal.center)
-        middle = ((system.lower + system.upper) / 2)[list(system.position)]
-        moved = tuple(map(float, center + 0.1 * (middle - center)))
-        other = replace(query, goal=replace(query.goal, center=moved))
-        start = sample_start(other, np.random.default_rng(0))
+        if isinstance(query.goal, Equilibrium):  # others may not be held; but start beside it
+            other, start = query, query.reference.copy()
+            start[0] += 2.0 * query.goal.radius
+        else:
+            center = np.array(query.goal.center)
+            middle = ((system.lower + system.upper) / 2)[list(system.position)]
+            moved = tuple(map(float, center + 0.1 * (middle - center)))
+            other = replace(query, goal=replace(query.goal, center=moved))
+            start = sample_start(other, np.random.default_rng(0))
         planner = self.planner_for(seconds)
         try:
             state = planner.start(other, [start])
@@ -71,9 +75,10 @@ def _eikonal(seconds: float | None = None) -> Planner:
 
 def _exact() -> OneShot:
     from ocp.pontryagin import ExactValue
+    from ocp.regulation import RegulationValue
 
     def solve(query: Query, starts: Sequence[NDArray[np.float64]]) -> Answer:
-        value = ExactValue(query)
+        value = RegulationValue(query) if query.is_regulation else ExactValue(query)
         if len(starts):
             value.value(np.array(starts))
         return greedy(query, value), value
@@ -124,11 +129,25 @@ def _mpc_value() -> OneShot:
     return OneShot(solve)
 
 
+def _value_iteration() -> OneShot:
+    from ocp.grids.lookahead import LookaheadPolicy
+    from ocp.grids.regulation_grid import solve_regulation_grid
+
+    def solve(query: Query, _starts: Sequence[NDArray[np.float64]]) -> Answer:
+        value = solve_regulation_grid(query)
+        return LookaheadPolicy(query, value), value
+
+    return OneShot(solve)
+
+
 METHODS: dict[str, Method] = {
     "adapt": Method("a network that knows the query, exact trajectories, then grids", _adapt),
     "exact": Method("Pontryagin shooting from every state the robot meets", _exact),
     "eikonal": Method(
         "fast marching on a grid, interpolated one-step lookahead", _eikonal, within=_eikonal
+    ),
+    "value-iteration": Method(
+        "to an equilibrium: value iteration on a grid, up to 4 states", _value_iteration
     ),
     "set-valued": Method("the set-valued method of Xu and Zhu on its coarse grid", _set_valued),
     "mpc": Method("receding horizon of 2 s, quadratic cost at its end", _mpc, 0.1),
@@ -139,6 +158,9 @@ METHODS: dict[str, Method] = {
 def default_method(query: Query) -> tuple[str, str | None]:
     """The method used where none is asked for, and why it is not `adapt` if it is not."""
     from learning.query_encoder import why_not_encodable
+
+    if query.is_regulation:
+        return "exact", "the goal is an equilibrium"
 
     reason = why_not_encodable(query)
     return ("adapt", None) if reason is None else ("eikonal", reason)
