@@ -20,7 +20,7 @@ from ocp.simplicial.indicator import error_indicator, marked_leaves
 from ocp.simplicial.mesh import Mesh
 from ocp.simplicial.mesh_value import MeshPolicy, MeshValue
 from ocp.simplicial.solution import TOLERANCE, Effort, MeshSolution, solve_on_mesh
-from ocp.simplicial.stencils import check_applies
+from ocp.simplicial.stencils import goal_ball
 
 Floats = NDArray[np.float64]
 
@@ -63,10 +63,10 @@ def uniform_mesh(query: Query, simplices: int) -> Mesh:
     """A Kuhn mesh of about so many simplices that suits a time-free query (see `Grid.for_query`).
 
     Raises:
-        SolveError: NOT_APPLICABLE, see `stencils.check_applies`.
+        SolveError: NOT_APPLICABLE, see `stencils.goal_ball`.
         ValueError: if there are too few simplices for a mesh.
     """
-    check_applies(query)
+    goal_ball(query)
     orders = (1, 2, 6)[query.system.n - 1]
     low, high = 3**query.system.n, max(2 * simplices, 3**query.system.n + 1)
     while high - low > 1:  # nodes of the largest grid that has no more cells

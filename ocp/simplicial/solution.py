@@ -11,7 +11,7 @@ from ocp.query import Query
 from ocp.simplicial import march as kernels
 from ocp.simplicial.mesh import Mesh
 from ocp.simplicial.mesh_value import MeshPolicy, MeshValue
-from ocp.simplicial.stencils import Stencils, merged, stencils
+from ocp.simplicial.stencils import GOAL_SLACK, Stencils, goal_ball, merged, stencils
 from ocp.trajectory import SolveError, Status
 
 Floats = NDArray[np.float64]
@@ -180,7 +180,7 @@ def solve_on_mesh(
     """V of a time-free query on a mesh.
 
     Args:
-        query: as `stencils.check_applies` demands.
+        query: see `stencils.goal_ball`.
         mesh: over its states; its grid may use the half-turn symmetry.
         table: correct the scheme by the exact value without obstacles, if the robot has one.
         tolerance: of V, relative to the scheme's fixed point.
@@ -211,7 +211,7 @@ def solve_on_mesh(
 
 def _given(query: Query, mesh: Mesh) -> tuple[NDArray[np.uint8], Floats]:
     """Which vertices are fixed, and values to start from."""
-    in_goal = query.goal_distance(mesh.vertices) <= 0
+    in_goal = query.goal_distance(mesh.vertices) <= GOAL_SLACK
     inside = np.zeros(len(in_goal), dtype=bool)
     if query.hard_obstacles:
         inside = query.clearance(mesh.vertices, hard_only=True) < 0
@@ -221,8 +221,9 @@ def _given(query: Query, mesh: Mesh) -> tuple[NDArray[np.uint8], Floats]:
 def _reach(query: Query, mesh: Mesh) -> float:
     """The largest distance of the mesh's box from the goal's boundary."""
     axes = list(query.system.position)
-    ends = np.array([mesh.grid.lower, mesh.grid.upper])[:, axes] - np.array(query.goal.center)
-    return max(0.0, float(np.linalg.norm(abs(ends).max(axis=0))) - query.goal.radius)
+    ball = goal_ball(query)
+    ends = np.array([mesh.grid.lower, mesh.grid.upper])[:, axes] - np.array(ball.center)
+    return max(0.0, float(np.linalg.norm(abs(ends).max(axis=0))) - ball.radius)
 
 
 def _set_factors(

@@ -21,7 +21,7 @@ from ocp.compiled.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled
 from ocp.compiled.parameters import parameters
 from ocp.grids.hard_obstacles import SEGMENT, clear_segment, hard_data
 from ocp.kernels import kernels
-from ocp.query import Query
+from ocp.query import Goal, Query
 from ocp.simplicial.mesh import Mesh
 from ocp.trajectory import SolveError, Status
 
@@ -32,6 +32,7 @@ I1 = types.Array(int64, 1, "C")
 I2 = types.Array(int64, 2, "C")
 FLAGS = types.Array(types.uint8, 1, "C")
 GOAL = -1
+GOAL_SLACK = 1e-9  # metres, so that rounding decides nothing
 ROOT_STEPS = 12
 ROOT_TOLERANCE = 1e-7  # share of an edge
 GAUSS = (0.21132486540518713, 0.7886751345948129)  # two-point rule on [0, 1]
@@ -72,26 +73,33 @@ class Stencils:
         return start, readers
 
 
-def check_applies(query: Query) -> None:
-    """Raise a SolveError, NOT_APPLICABLE, if there are no stencils for this query's robot."""
-    system = query.system
+def goal_ball(query: Query) -> Goal:
+    """The goal of a query to which the scheme applies.
+
+    Raises:
+        SolveError: NOT_APPLICABLE, saying which condition fails.
+    """
+    system, goal = query.system, query.goal
+    if not isinstance(goal, Goal):
+        raise SolveError(Status.NOT_APPLICABLE, "the goal must be a ball")
     if not query.is_time_free:
         detail = "the time-free form needs no drift and no input bounds"
         raise SolveError(Status.NOT_APPLICABLE, detail)
     if not (system.m == system.n <= 3 or (system.n, system.m) == (3, 2)):
         detail = f"{system.name} has {system.n} states and {system.m} inputs; 3 and 2, or as many"
         raise SolveError(Status.NOT_APPLICABLE, f"{detail} inputs as states, up to 3, are needed")
+    return goal
 
 
 def stencils(query: Query, mesh: Mesh, which: Ints | None = None) -> Stencils:
     """The stencils of a time-free query on a mesh.
 
     Args:
-        query: as `check_applies` demands.
+        query: see `goal_ball`.
         mesh: over its states.
         which: the vertices to make them for; the others get none. By default all.
     """
-    check_applies(query)
+    ball = goal_ball(query)
     k, system = kernels(query), query.system
     bare = replace(query, obstacles=(), cost=replace(query.cost, state=None))
     count = len(mesh.vertices)
@@ -105,7 +113,7 @@ def stencils(query: Query, mesh: Mesh, which: Ints | None = None) -> Stencils:
     blocked = np.zeros(count, dtype=np.uint8)
     effort = np.empty((faces * corners, system.m))
     pieces = np.empty((faces * 4, 3), dtype=np.int64)
-    goal = np.array([query.goal.radius, *query.goal.center])
+    goal = np.array([ball.radius + GOAL_SLACK, *ball.center])
     feet, joined = _build(
         k.dynamics, k.state_cost, kernels(bare).state_cost, clear_segment, parameters(query),
         parameters(bare), query.input_weights, goal, np.array(system.position), hard_data(query),
