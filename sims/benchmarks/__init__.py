@@ -20,6 +20,7 @@ BENCHMARKS: dict[str, str] = {
     "grids": "eikonal and set-valued grids: time, value error, closed-loop excess",
     "lqr": "analytic LQR: Riccati, matrix exponential, collocation and PMP",
     "orders": "orders of convergence of the grid schemes, on and off the axis",
+    "refmm": "ReFMM: orders, refined against uniform meshes, repair against a new solve",
     "rrtx": "RRT^X: repair after changes, against growth from scratch, OMPL and the optimum",
     "store": "value store: time and bytes an entry, kills survived",
 }
