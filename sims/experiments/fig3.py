@@ -331,8 +331,8 @@ def entries(document: dict[str, Any]) -> list[Entry]:
                 "about 80 %, read off the figure",
                 ours=percent(rows[-1]["reached"]),
                 optimum="100 %",
-                remark=f"After {seconds(rows[-1]['seconds'])}; {percent(rows[0]['reached'])} before "
-                "the first trajectory.",
+                remark=f"After {seconds(rows[-1]['seconds'])}; with the network alone, "
+                f"before any trajectory, {percent(rows[0]['reached'])}.",
             )
         )
     generation = {r["workers"]: r for r in document["generation"]}
