@@ -39,7 +39,7 @@ for name in NAMES:
         ready, costs, optimum, lost = [], 0.0, 0.0, 0
         for query in queries:
             try:
-                planner = method.within(budget) if method.within else method.planner()
+                planner = method.planner_for(budget)
                 answer = plan(planner, query, starts, deadline(budget))
             except SolveError:
                 lost += len(starts)
