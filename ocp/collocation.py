@@ -52,6 +52,7 @@ def solve_collocation(
     max_intervals: int = 160,
     max_iterations: int = 300,
     time_limit: float = 60.0,
+    state_tolerance: float = STATE_TOLERANCE,
 ) -> Trajectory:
     """The optimal motion from `start` `[n]`.
 
@@ -76,6 +77,7 @@ def solve_collocation(
         max_intervals: of the finest mesh.
         max_iterations: of IPOPT, in one solve.
         time_limit: seconds for all solves, the building of programs not counted.
+        state_tolerance: largest gap of a replayed interval's end state.
 
     Returns:
         The motion at its start and all collocation points, with costates.
@@ -111,6 +113,7 @@ def solve_collocation(
         max_intervals,
         max_iterations,
         time.monotonic() + time_limit,
+        state_tolerance,
     )
     guesses = default_guesses(query, start, horizon) if guess is None else [guess]
     return search.cheapest(guesses).trajectory()
@@ -151,6 +154,7 @@ class _Search:
     max_intervals: int
     max_iterations: int
     deadline: float
+    state_tolerance: float
 
     def cheapest(self, guesses: list[Trajectory]) -> CollocatedMotion:
         """Solve on a coarse mesh from every guess, then refine the cheapest answers."""
@@ -315,7 +319,7 @@ class _Search:
 
     def _agrees(self, motion: CollocatedMotion, verdict: ReplayVerdict) -> bool:
         allowed = self.tolerance * max(motion.total_cost, 1e-9)
-        return bool(np.abs(verdict.errors).sum() <= allowed) and verdict.gap <= STATE_TOLERANCE
+        return bool(np.abs(verdict.errors).sum() <= allowed) and verdict.gap <= self.state_tolerance
 
 
 def _moved(mesh: Array, errors: Array, count: int) -> Array:

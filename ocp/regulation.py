@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 TERMINAL_SHARE = 1e-3  # of the cost, that the regulator's tail may be
 TAIL_SHARE = 1e-10  # of the cost, that is left where a motion ends
-FIRST_HORIZONS = (1.5, 4.0)  # in time constants of the regulator
+FIRST_HORIZONS = (1.5, 4.0)  # in units of `_time_scale`
 LONGEST = 60.0  # seconds
 STEP = 0.01  # seconds, of the tail and the second derivatives
 NEAR = 0.05  # of the domain: beyond it a state asks for a motion of its own
@@ -96,9 +96,10 @@ def solve_regulation(
                 horizon=rough.duration,
                 terminal_cost=P,
                 intervals=intervals,
-                tolerance=1e-4,
-                max_intervals=4 * intervals,
+                tolerance=1e-3,
+                max_intervals=8 * intervals,
                 time_limit=time_limit,
+                state_tolerance=1e-3,
             )
             found.append(motion)
         except SolveError as failure:
@@ -150,6 +151,7 @@ def _settled(
             tolerance=1e-5,
             max_intervals=8 * intervals,
             time_limit=time_limit,
+            state_tolerance=1e-4,
         )
 
 
@@ -246,15 +248,23 @@ def _guesses(query: Query, start: Array) -> Iterator[Trajectory]:
         (0.0, -np.sign(d) * p) if p and abs(d) > 0.25 * p else (0.0,)
         for d, p in zip(offset, system.period, strict=True)
     ]
-    slowest = 1.0 / regulator(query).decay_rate
+    scale = _time_scale(query, start)
     for horizon, way in product(FIRST_HORIZONS, list(product(*turns))[:4]):
-        seconds = min(max(horizon * slowest, 1.0), LONGEST / 4)
+        seconds = min(horizon * scale, LONGEST / 4)
         fractions = np.linspace(0.0, 1.0, 64)
         states = start + fractions[:, None] * (offset + np.array(way))
         inputs = np.tile(query.reference_input, (64, 1))
         spent = running_costs(query, states, inputs)
         costs = np.concatenate([[0.0], np.cumsum((spent[1:] + spent[:-1]) / 2)]) * seconds / 63
         yield Trajectory(seconds * fractions, states, inputs, None, costs, Status.NOT_CONVERGED)
+
+
+def _time_scale(query: Query, start: Array) -> float:
+    """Seconds: of the regulator's slowest decay, or half a swing of the robot where it starts."""
+    A, _ = linearise(query.system, start, query.reference_input)
+    turning = np.abs(np.linalg.eigvals(A).imag)
+    swings = np.pi / turning[turning > 0.1]
+    return float(max(1.0 / regulator(query).decay_rate, swings.max(initial=0.5)))
 
 
 class RegulatorValue:

@@ -89,7 +89,8 @@ class MultibodyModel:
     velocity_order: tuple[int, ...]
 
     @cached_property
-    def _order(self) -> NDArray[np.intp]:
+    def order(self) -> NDArray[np.intp]:
+        """`[n]`, the plant's index of each state of the System."""
         k = len(self.position_order)
         return np.array([*self.position_order, *(k + i for i in self.velocity_order)])
 
@@ -97,12 +98,12 @@ class MultibodyModel:
         """The plant's [q, v] `[..., n]` of states `[..., n]`."""
         states = np.asarray(states, dtype=float)
         plain = np.empty_like(states)
-        plain[..., self._order] = states
+        plain[..., self.order] = states
         return plain
 
     def from_drake(self, states: ArrayLike) -> Array:
         """States `[..., n]` of the plant's [q, v] `[..., n]`."""
-        return np.asarray(states, dtype=float)[..., self._order]
+        return np.asarray(states, dtype=float)[..., self.order]
 
     def diagram(self) -> Any:
         """The robot in Drake alone, its propellers Drake's: input "u" `[m]`, output "state" `[n]`.

@@ -100,7 +100,7 @@ def test_derivatives_equal_drakes_automatic_ones(model: MultibodyModel) -> None:
         diagram.GetInputPort("u").FixValue(context, both[n:])
         rates = diagram.EvalTimeDerivatives(context).CopyToVector()
         gradient = ExtractGradient(rates.reshape(-1, 1))
-        order = model._order
+        order = model.order
         A, B = linearise(model.system, x, u)
         scale = np.abs(gradient).max()
         assert_allclose(A, gradient[:, :n][np.ix_(order, order)], atol=1e-10 * scale)
@@ -119,7 +119,7 @@ def test_linearisation_and_regulator_agree_three_ways(model: MultibodyModel) -> 
     context.SetContinuousState(model.to_drake(rest))
     diagram.GetInputPort("u").FixValue(context, u)
     linear = Linearize(diagram, context)
-    order = model._order
+    order = model.order
     scale = np.abs(A).max()
     assert_allclose(A, np.array(linear.A())[np.ix_(order, order)], atol=1e-8 * scale)
     assert_allclose(B, np.array(linear.B())[order], atol=1e-8 * np.abs(B).max())
