@@ -65,6 +65,8 @@ EVASIONS = (0.4, 1.2, 3.0)
 """Metres: how far away references are tried when braking alone is not enough."""
 RETRY = 0.5
 """Seconds between two attempts at the padding that is preferred, or at a route where none was."""
+SPROUTS = 40
+"""At each such attempt, this part of the tree's nodes is added, until they have doubled."""
 NEWS = 0.3
 """Metres that the robot moves without a route before one is asked for again."""
 
@@ -321,6 +323,9 @@ class Navigator:
             if time - when < RETRY and np.linalg.norm(inside - where) < NEWS:
                 self.perceived.refresh(time)
                 return False
+            if self.planner.nodes < 2 * self.settings.nodes:
+                # Perhaps there is a way that no edge of the tree takes.
+                self.planner.grow(self.settings.nodes // SPROUTS)
         self._asked = time, inside
         self._change(
             time,
