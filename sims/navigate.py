@@ -58,7 +58,7 @@ class Navigation:
         phases: `[k]`, what the robot was doing.
         legs: `[k]`, the number of the leg.
         fine_times, track, clearances: `[j]`, `[j, d]`, `[j]` at every integration step.
-        reached, collided: what became of it.
+        reached, collided, lost: what became of it; lost is who left the arena for good.
         duration: seconds until it arrived, or until the run ended.
         sample_period: seconds.
         wall_seconds: of the whole simulation, all robots.
@@ -81,6 +81,7 @@ class Navigation:
     clearances: Array
     reached: bool
     collided: bool
+    lost: bool
     duration: float
     sample_period: float
     wall_seconds: float
@@ -96,6 +97,17 @@ class Navigation:
         """Metres between the body and an obstacle, at least; `None` if there never was one."""
         least = float(self.clearances.min())
         return least if np.isfinite(least) else None
+
+    @property
+    def failure(self) -> str:
+        """Why it did not arrive; empty if it did."""
+        if self.reached:
+            return ""
+        if self.collided:
+            return "collided"
+        if self.lost:
+            return "left the arena for good"
+        return self.navigator.reason or f"was still {self.navigator.phase.value}"
 
     @property
     def missed(self) -> int:
@@ -242,6 +254,7 @@ def run(
                 clearances[:, number],
                 reached,
                 number in judge.hit,
+                number in judge.lost,
                 arrivals[0] if reached else float(fine[-1]),
                 scenario.sample_period,
                 driven.wall_seconds,

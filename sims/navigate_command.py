@@ -63,6 +63,5 @@ def _table(name: str, report: dict[str, Any], runs: "list[Navigation]") -> Table
     for number, r in enumerate(runs):
         if not r.reached:
             who = f"robot {number}: " if len(runs) > 1 else ""
-            reason = r.navigator.reason or r.navigator.phase.value
-            table.add_row("not arrived", who + ("collided" if r.collided else reason))
+            table.add_row("not arrived", who + r.failure)
     return table

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 STEPS = 4
 """Integration steps (Runge-Kutta 3) a sample period. With the input held, a step of h has the error
 (h s)^4/24 for a mode of rate s: 4e-8 at 2.5/s and 50/4 ms."""
+LOST = 10.0
+"""Sides of the arena: a robot that far away will not come back."""
 IN_SIGHT = 200.0
 """Metres: obstacles farther away do not count as there."""
 
@@ -133,6 +135,7 @@ class Judge:
         clearances: `[k, robots]`, metres between each body and what is nearest; infinite if
             nothing is in sight.
         hit: the robots that collided.
+        lost: the robots that left the arena for good: ten sides away, or without a finite state.
     """
 
     def __init__(self, scenario: Scenario, diagram: Any, scene: Any, bodies: Bodies) -> None:
@@ -142,6 +145,9 @@ class Judge:
         self.positions: list[Array] = []
         self.clearances: list[Array] = []
         self.hit: set[int] = set()
+        self.lost: set[int] = set()
+        self._middle = (scenario.lower + scenario.upper) / 2
+        self._leash = LOST * float((scenario.upper - scenario.lower).max())
 
     def look(self, context: Context) -> None:
         """Record the present instant."""
@@ -153,6 +159,9 @@ class Judge:
         positions, clearances = [], []
         for number, robot in enumerate(self._scenario.robots):
             position = states[self._bodies.places[number]][:d]
+            if not np.linalg.norm(position - self._middle) < self._leash:
+                self.lost.add(number)
+                return
             near = query.ComputeSignedDistanceToPoint(in_space(position), IN_SIGHT)
             away = [a.distance for a in near if self._bodies.keys.get(a.id_G) != number]
             clearance = min(away, default=np.inf) - robot.radius
@@ -187,7 +196,7 @@ def drive(
     stopping: Array,
     recorders: Sequence[Recorder | None],
 ) -> Drive:
-    """Run a scenario in Drake's Simulator until all arrived, one collided, or time is up.
+    """Run a scenario in Drake's Simulator until all arrived, one collided or was lost, or time is up.
 
     Args:
         scenario: the world and its robots.
@@ -245,6 +254,8 @@ def drive(
         judge.look(root)
         if judge.hit:
             return EventStatus.ReachedTermination(diagram, "a robot collided")
+        if judge.lost:
+            return EventStatus.ReachedTermination(diagram, "a robot is lost")
         if all(n.phase is Phase.ARRIVED for n in navigators):
             return EventStatus.ReachedTermination(diagram, "every robot arrived")
         return EventStatus.DidNothing()

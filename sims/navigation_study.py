@@ -74,7 +74,7 @@ def summary(result: Navigation) -> dict[str, Any]:
         "missed": result.missed,
         "samples": len(result.times),
         "excess": excess,
-        "end": "" if result.reached else result.navigator.reason or result.navigator.phase.value,
+        "end": result.failure,
     }
 
 

@@ -50,7 +50,7 @@ class Glider:
     def control(self, error):
         return -self.gain[0] * error[:2] - self.gain[1] * error[2:]
 
-    def forecast(self, errors, receding):
+    def forecast(self, errors, receding):  # noqa: ARG002
         if not self.tells:
             return None
         axes = np.stack([errors[:, :2], errors[:, 2:]])
@@ -212,7 +212,7 @@ def test_the_papers_legs_end_within_the_window_of_their_waypoint():
 
 def test_a_leg_whose_horizon_expires_begins_anew_to_the_same_waypoint():
     class Stuck(Glider):
-        def drive(self, state, reference):
+        def drive(self, state, reference):  # noqa: ARG002
             self.time += PERIOD
             return state
 

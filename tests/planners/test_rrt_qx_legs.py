@@ -135,7 +135,7 @@ def test_the_first_clear_path_is_the_first_of_those_that_are_clear():
     begin = int(np.argmin(every))
     paths, every = np.roll(paths, -begin, axis=0), np.roll(every, -begin)
     clear = np.flatnonzero(every >= 0.1)
-    assert 0 < clear[0]
+    assert clear[0] > 0
     assert around.first_clear(paths, PERIOD, 2.0, 0.1) == clear[0]
     assert around.first_clear(paths[: clear[0]], PERIOD, 2.0, 0.1) is None
 

@@ -124,7 +124,7 @@ def test_a_robot_that_cannot_stand_still_is_refused_unless_it_is_simulated_in_er
     A = [[-1, 0, 1, 0], [0, -1, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0]]
     B = [[0, 0], [0, 0], [1, 0], [0, 1]]
     table = {"A": A, "B": B}
-    with pytest.raises(ValueError, match="plant.A: no input holds"):
+    with pytest.raises(ValueError, match=r"plant\.A: no input holds"):
         Scenario.from_dict(changed(["plant"], table))
     anchored = Scenario.from_dict(changed(["plant"], table | {"anchored": True}))
     assert anchored.robots[0].plant.anchored
