@@ -8,7 +8,7 @@ from rich.console import Console
 
 from ocp.execution import open_door
 from ocp.query_file import read_toml
-from sims.exit_status import reading_input
+from sims.exit_status import BadInputError, reading_input
 
 if TYPE_CHECKING:
     from sims import cli
@@ -23,7 +23,7 @@ PRELOAD = ("learning.value_samples",)
 def run(command: "cli.Train") -> int:
     """Run the command; returns its exit status."""
     from learning import config as faithful
-    from learning import training
+    from learning import training, trpo
 
     paths = [command.config] if command.config else [CONFIGS / f"{n}.toml" for n in SHIPPED]
     with reading_input():
@@ -34,8 +34,10 @@ def run(command: "cli.Train") -> int:
                 settings.append(training.TrainingSettings.load(path))
             elif kind == faithful.KIND:
                 settings.append(faithful.Config.load(path))
+            elif kind == trpo.KIND:
+                settings.append(trpo.TrpoSettings.load(path))
             else:
-                known = f"{training.KIND}, {faithful.KIND}"
+                known = f"{training.KIND}, {faithful.KIND}, {trpo.KIND}"
                 raise ValueError(f"{path}: kind: {kind!r} is unknown; known are {known}")
     document = []
     for path, one in zip(paths, settings, strict=True):
@@ -51,6 +53,7 @@ def run(command: "cli.Train") -> int:
 
 def _train(settings: Any, path: Path, folder: Path, command: "cli.Train") -> dict[str, Any]:
     from learning.training import TrainingSettings
+    from learning.trpo import TrpoSettings
 
     if isinstance(settings, TrainingSettings):
         from learning.training_run import run as train
@@ -58,6 +61,14 @@ def _train(settings: Any, path: Path, folder: Path, command: "cli.Train") -> dic
         how = f"zermelo train {path.parent.name}/{path.name}"
         with reading_input(), open_door(command.workers, command.cluster, PRELOAD) as door:
             weights = train(settings, folder, door, how)
+    elif isinstance(settings, TrpoSettings):
+        try:
+            from learning.trpo_training import train as train_trpo
+        except ImportError as error:
+            raise BadInputError(f"{path}: training by TRPO needs the extra rl: {error}") from error
+
+        with reading_input():
+            weights = train_trpo(settings, folder, f"zermelo train {path.parent.name}/{path.name}")
     else:
         from learning.meta import train as train_faithful
 
@@ -76,12 +87,14 @@ def figure(curve: Path, out: Path) -> None:
 
     table = json.loads(curve.read_text(encoding="utf-8"))
     columns, rows = table["columns"], table["rows"]
+    signed = any(value <= 0 for row in rows for value in row[1:])
     drawn, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
-    counts = columns[0] == "step"
+    counts = columns[0] in ("step", "steps")
     steps = [row[0] for row in rows] if counts else list(range(1, len(rows) + 1))
     for k, name in enumerate(columns):
-        if name not in ("step", "seconds"):
-            axes.semilogy(steps, [row[k] for row in rows], label=name)
+        if name not in ("step", "steps", "seconds"):
+            axes.plot(steps, [row[k] for row in rows], label=name)
+    axes.set_yscale("symlog" if signed else "log")
     axes.set_xlabel("step")
     axes.set_ylabel("loss")
     axes.grid(which="both", alpha=0.3)
