@@ -125,9 +125,8 @@ class HorizonValue:
         Raises:
             SolveError: if no motion was found from a state.
         """
-        rows = self._rows(states)
-        inside = self.query.goal_distance(rows) <= 0
-        flat = zip(rows.reshape(-1, rows.shape[-1]), np.ravel(inside), strict=True)
+        rows = self.rows(states)
+        flat = zip(rows.reshape(-1, rows.shape[-1]), self.at_rest(rows), strict=True)
         costs = [0.0 if arrived else self.motion(x).cost for x, arrived in flat]
         return np.array(costs).reshape(rows.shape[:-1])
 
@@ -137,9 +136,8 @@ class HorizonValue:
         Raises:
             SolveError: if no motion was found from a state.
         """
-        rows = self._rows(states)
-        inside = self.query.goal_distance(rows) <= 0
-        flat = zip(rows.reshape(-1, rows.shape[-1]), np.ravel(inside), strict=True)
+        rows = self.rows(states)
+        flat = zip(rows.reshape(-1, rows.shape[-1]), self.at_rest(rows), strict=True)
         slopes = [np.zeros(len(x)) if arrived else self.motion(x).costate for x, arrived in flat]
         return np.array(slopes).reshape(rows.shape)
 
@@ -211,7 +209,13 @@ class HorizonValue:
         ]
         return np.stack(states, axis=-1), np.stack(inputs, axis=-1)
 
-    def _rows(self, states: ArrayLike) -> Array:
+    def at_rest(self, rows: Array) -> NDArray[np.bool_]:
+        """Which of the states `[..., n]`, flattened, lie in a goal ball, where motions end."""
+        inside = self.query.goal_distance(rows) <= 0
+        return np.ravel(inside) & (not self.query.is_regulation)
+
+    def rows(self, states: ArrayLike) -> Array:
+        """`states` `[..., n]` as finite numbers."""
         rows = np.asarray(states, dtype=float)
         n = self.query.system.n
         if rows.shape[-1:] != (n,) or not np.isfinite(rows).all():
@@ -235,8 +239,8 @@ class RecedingHorizonPolicy:
         Raises:
             SolveError: if no motion was found from a state.
         """
-        rows = self.value._rows(states)
-        inside = np.ravel(self.query.goal_distance(rows) <= 0)
+        rows = self.value.rows(states)
+        inside = self.value.at_rest(rows)
         m = self.query.system.m
         inputs = [
             np.zeros(m) if arrived else self.value.motion(x).inputs[0]

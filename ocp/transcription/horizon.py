@@ -22,7 +22,7 @@ from ocp import cost as costs
 from ocp.kernels import parameters
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status
-from ocp.transcription.terms import Structure, clearance, state_cost, symbol
+from ocp.transcription.terms import Structure, clearance, effort, state_cost, symbol
 
 Array = NDArray[np.float64]
 
@@ -247,14 +247,15 @@ def _runge_kutta(structure: Structure, step: float) -> ca.Function:
     layout, system = structure.layout, structure.system
     x, u = symbol("x", layout.n), symbol("u", layout.m)
     q = symbol("q", layout.count + 1 + layout.stride * len(structure.facets))
-    effort = ca.dot(q[: layout.m], u**2)
     moved, total = x, ca.SX(0)
     rate = ca.SX.zeros(layout.n, 1)
     for weight, share in ((1, 0.0), (2, 0.5), (2, 0.5), (1, 1.0)):
         at = x + share * step * rate
         rate = system.dynamics(at, u)
         moved += step * weight / 6 * rate
-        total += step * weight / 6 * (_smooth_state_cost(structure, at, q) + effort)
+        total += (
+            step * weight / 6 * (_smooth_state_cost(structure, at, q) + effort(structure, u, q))
+        )
     return ca.Function("step", [x, u, q], [moved, total])
 
 

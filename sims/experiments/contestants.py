@@ -114,7 +114,7 @@ def _eikonal(nodes: int) -> Callable[[], Planner]:
     return make
 
 
-def _faithful() -> Planner:
+def _faithful() -> Any:
     from learning.faithful_planner import PRETRAINED, FaithfulPlanner
 
     if not PRETRAINED.is_file():

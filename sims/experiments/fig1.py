@@ -70,13 +70,13 @@ def sheet(document: dict[str, Any]) -> Sheet:
                 name = "{}, ({:g}, {:g}), ({:g}, {:g}, {:.3g})".format(key, *panel["goal"], *start)
                 cost = None if loop is None else loop["cost"]
                 least = optimum["cost"]
-                known = cost is not None and least is not None
+                excess = None if cost is None or least is None else cost / least - 1
                 clips = optimum["path"] and query.clearance(optimum["path"]).min() < 0
                 result.add(
                     name,
                     number(cost, "{:.3f}", "not reached"),
                     number(least, "{:.3f}"),
-                    percent(cost / least - 1 if known else None),
+                    percent(excess),
                     "-" if loop is None else ("yes" if loop["collided"] else "no"),
                     "yes" if clips else "no",
                 )

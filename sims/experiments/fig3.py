@@ -112,7 +112,7 @@ def _judged(key: str, seed: int, k: int, starts: int, counts: tuple[int, ...]) -
             answer = plan(who.planner(), query, asked, trajectories(n))
             spent = time.process_time() - begun
             values = np.asarray(answer.value.value(states))
-            loops = rollouts(answer.policy, states, LoopSettings(period=who.held))
+            loops = rollouts(answer.policy, list(states), LoopSettings(period=who.held))
         except (SolveError, FloatingPointError) as error:
             found.append({"n": n, "failure": str(error)})
             continue
@@ -281,7 +281,8 @@ def draw(document: dict[str, Any], out: Path) -> list[Path]:
     b.plot([2, 16], [50, 90], "*", mfc="none", mec="#D55E00", ms=11, label="the paper's claims")
     b.set(xlabel="trajectories n", ylabel="starts that reach the goal (%)", ylim=(0, 104))
     b.legend(frameon=False, loc="center right")
-    c.set(xlabel="trajectories n", ylabel="mean value error (% of mean V)")
+    c.set(xlabel="trajectories n", ylabel="mean value error (% of mean V)", ylim=(0.05, 200))
+    c.set_yticks([0.1, 1, 10, 100], ["0.1", "1", "10", "100"])
     c.legend(frameon=False)
     counts = [r["obstacles"] for r in document["obstacles"]]
     for key, label, colour, mark in (
@@ -295,6 +296,7 @@ def draw(document: dict[str, Any], out: Path) -> list[Path]:
     d.legend(frameon=False)
     for tag, axes in zip("abcd", (a, b, c, d), strict=True):
         axes.set_title(f"({tag})", loc="left")
+        axes.xaxis.get_major_locator().set_params(integer=True)
         axes.grid(alpha=0.3)
     return save_all(figure, out / "fig3")
 

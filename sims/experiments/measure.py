@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ocp.oracle import consult
 from ocp.planning import Plan, plan
-from ocp.query import Query
+from ocp.query import Goal, Query
 from ocp.query_family import PAPER_START, paper_query
 from ocp.trajectory import SolveError, Trajectory
 from sims.closed_loop import LoopSettings, Rollout, rollouts
@@ -49,8 +49,8 @@ def rehearse(contestant: Contestant, query: Query | None = None) -> None:
     from dataclasses import replace
 
     query = query or paper_query((4.0, 4.0))
-    center = tuple(0.98 * x for x in query.goal.center)
-    other = replace(query, goal=replace(query.goal, center=center))
+    center = tuple(0.98 * float(x) for x in query.goal_position)
+    other = replace(query, goal=Goal(center, query.goal.radius))
     answer = plan(contestant.planner(), other, [PAPER_START], contestant.until)
     answer.policy(np.array(PAPER_START))
 
