@@ -324,25 +324,25 @@ def _figure(rows: list[dict[str, Any]], query: Query, out: Path) -> None:
         panel.grid(which="both", alpha=0.3)
     axes[1].legend(frameon=False, fontsize=7)
     _slice(axes[2], query)
-    axes[2].set_title("(c) refined for one start, heading -π/4", loc="left")
+    axes[2].set_title("(c) refined for one start", loc="left")
     for suffix in (".png", ".svg"):
         save(figure, out / f"refmm{suffix}")
 
 
 def _slice(panel: Any, query: Query) -> None:
-    """The size of the leaf at each position, at the start's heading, and the way from the start."""
+    """The smallest leaf over all headings at each position, and the way from the start."""
     from sims.figures import draw_plan
 
     start = np.array(PAPER_START)
     solution = solve_refmm(query, [start], RefmmSettings(last=COARSE)).solution
-    side = np.linspace(-4.99, 4.99, 241)
-    x, y = np.meshgrid(side, side)
-    states = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, start[2])])
     mesh = solution.mesh
-    vertices, _ = mesh.locate(states)
+    side, headings = np.linspace(-4.99, 4.99, 161), np.linspace(-np.pi, 0.0, 24, endpoint=False)
+    x, y, heading = np.meshgrid(side, side, headings)
+    vertices, _ = mesh.locate(np.column_stack([x.ravel(), y.ravel(), heading.ravel()]))
     corners = mesh.vertices[vertices]
     edges = mesh.difference(corners[:, 1:], corners[:, :1])
-    volumes = abs(np.linalg.det(edges)) / 6
-    image = panel.pcolormesh(x, y, np.cbrt(6 * volumes).reshape(x.shape), cmap="viridis")
-    panel.figure.colorbar(image, ax=panel, label="(6 volume)$^{1/3}$ of the simplex (m)")
+    sizes = np.cbrt(abs(np.linalg.det(edges))).reshape(x.shape).min(axis=2)
+    image = panel.pcolormesh(x[..., 0], y[..., 0], sizes, cmap="Greys_r")
+    label = "smallest (6 volume)$^{1/3}$ over headings (m)"
+    panel.figure.colorbar(image, ax=panel, label=label)
     draw_plan(panel, query, [rollout(solution.policy(), start)])
