@@ -144,7 +144,7 @@ def brute_force(solution: MeshSolution, v: int) -> float:
 
         found = minimize_scalar(cost, bounds=(0, 1), method="bounded", options={"xatol": 1e-9})
         if 1e-6 < found.x < 1 - 1e-6:
-            best = min(best, float(found.fun))
+            best = min(best, float(found.fun))  # pyright: ignore[reportAttributeAccessIssue]
     return best
 
 
