@@ -82,10 +82,10 @@ class NetworkValue:
         """Closed loops of the greedy policy from states `[k, 3]`, in steps of constant length.
 
         Returns:
-            `[most, k, 6]`, each step's state, input and duration; and `[k]`, the number of steps
-            after which the goal was reached, or -1.
+            `[most, k, 7]`, each step's state, input, duration and the cost before it; and `[k]`,
+            the number of steps after which the goal was reached, or -1.
         """
-        path = np.empty((most, len(starts), 6))
+        path = np.empty((most, len(starts), 7))
         steps = _drive(*self.arguments, np.ascontiguousarray(starts, dtype=float), stride, path)
         return path, steps
 
@@ -300,22 +300,25 @@ def _control(functions, table, numbers, q, bare, obstacles, weights, sizes, stat
 def _drive(functions, table, numbers, q, bare, obstacles, weights, sizes, starts, stride, path):
     """Closed loops in midpoint steps of constant length, until the goal.
 
-    Fills path `[s, k, n + m + 1]` with states, inputs and durations of steps; returns the number of
-    steps after which each was in the goal, or -1.
+    Fills path `[s, k, n + m + 2]` with states, inputs, durations of steps and costs before them;
+    returns the number of steps after which each was in the goal, or -1.
     """
     dynamics = kernel_at(functions[4, 0], functions[4, 1])
+    state_cost = scalar_at(functions[6, 0], functions[6, 1])
     most, count, n = path.shape[0], starts.shape[0], starts.shape[1]
-    m = path.shape[2] - n - 1
+    m = path.shape[2] - n - 2
     steps = np.full(count, -1)
     active = np.arange(count)
     rate, half = np.empty(n), np.empty(n)
     x = starts.copy()
+    spent = np.zeros(count)
     left = count
     for s in range(most):
         remaining = 0
         for a in range(left):
             i = active[a]
             path[s, i, :n] = x[i]
+            path[s, i, n + m + 1] = spent[i]
             gap = (x[i, 0] - numbers[0]) ** 2 + (x[i, 1] - numbers[1]) ** 2
             if gap <= numbers[2] ** 2:
                 steps[i] = s
@@ -340,6 +343,7 @@ def _drive(functions, table, numbers, q, bare, obstacles, weights, sizes, starts
             for j in range(n):
                 half[j] = x[i, j] + 0.5 * h * rate[j]
             dynamics(half, inputs[a], rate)
+            spent[i] += 2.0 * np.sqrt(state_cost(half, q)) * stride  # at the best speed
             for j in range(n):
                 x[i, j] += h * rate[j]
             path[s, i, n : n + m] = inputs[a]

@@ -9,6 +9,7 @@ tell where the network chose the wrong class of motions.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,6 +48,25 @@ class Step:
     nodes: int = 0
 
 
+@dataclass(frozen=True)
+class Loop:
+    """A closed loop of the network, as `NetworkValue.drive` left it.
+
+    Attributes:
+        path: `[k + 1, 7]`, up to the first state in the goal.
+        cost: about its cost.
+    """
+
+    path: Floats
+    cost: float
+
+    def motion(self, query: Query) -> Trajectory:
+        """The loop as a guess."""
+        n, m = query.system.n, query.system.m
+        moved = self.path[:-1]
+        return timed(query, self.path[:, :n], moved[:, n + m], moved[:, n : n + m])
+
+
 @dataclass
 class Clock:
     """How long steps take on this machine, learned as they are taken."""
@@ -78,7 +98,8 @@ class MetaState:
         network: its network's value.
         starts: `[k, n]`, those asked for, then those of the planner's own choice.
         asked: how many were asked for.
-        guesses: the best rough motion from each start, or `None`.
+        loops: the network's closed loop from each start; `None` if it does not get to the goal, or
+            a grid knows a better class of motions.
         extremals: the best exact trajectory from each start, or `None`.
         base: policy and value off the tubes.
         nodes: of the grid behind `base`; 0 if it is the network's.
@@ -93,7 +114,7 @@ class MetaState:
     network: NetworkValue
     starts: Floats
     asked: int
-    guesses: tuple[Trajectory | None, ...]
+    loops: tuple[Loop | None, ...]
     base: tuple[Policy, Value]
     pending: tuple[Step, ...]
     worth_nodes: int
@@ -107,10 +128,11 @@ class MetaState:
     def finished(self) -> bool:
         return not self.pending
 
-    @property
-    def solved(self) -> list[Extremal]:
-        """The exact trajectories found."""
-        return [e for e in self.extremals if e is not None]
+    @cached_property
+    def tubes(self) -> Tubes | None:
+        """Around the exact trajectories found, if there are any."""
+        solved = [e for e in self.extremals if e is not None]
+        return Tubes.around(self.query, solved) if solved else None
 
 
 @dataclass(frozen=True)
@@ -164,19 +186,19 @@ class MetaPlanner:
             raise SolveError(Status.NOT_APPLICABLE, "the network was trained on other queries")
         network = NetworkValue(encoder, chosen.weights)
         rows = np.array(starts, dtype=float).reshape(-1, query.system.n)
-        guesses = _loops(network, rows)
+        loops = _loops(network, rows)
         state = MetaState(
             query,
             network,
             rows,
             len(rows),
-            guesses,
+            loops,
             (NetworkPolicy(network), network),
             self._steps(len(rows), chosen.worth_nodes),
             chosen.worth_nodes,
             (None,) * len(rows),
         )
-        if self.grids and any(g is None for g in guesses):
+        if self.grids and any(x is None for x in loops):
             state = self._grid(state, GRIDS[0])
             state = replace(state, pending=tuple(s for s in state.pending if s.nodes != GRIDS[0]))
         return self._timed(state)
@@ -203,15 +225,11 @@ class MetaPlanner:
 
     def policy(self, state: MetaState) -> Policy:
         """Tubes around the exact trajectories, the best policy known elsewhere."""
-        if not state.solved:
-            return state.base[0]
-        return TubePolicy(Tubes.around(state.query, state.solved), state.base[0])
+        return state.base[0] if state.tubes is None else TubePolicy(state.tubes, state.base[0])
 
     def value(self, state: MetaState) -> Value:
         """V that belongs to `policy`."""
-        if not state.solved:
-            return state.base[1]
-        return TubeValue(Tubes.around(state.query, state.solved), state.base[1])
+        return state.base[1] if state.tubes is None else TubeValue(state.tubes, state.base[1])
 
     def _timed(self, state: MetaState) -> MetaState:
         expected = self.clock.expected(state.pending[0]) if state.pending else 0.0
@@ -222,19 +240,20 @@ class MetaPlanner:
         query = state.query
         solution = solve_eikonal(query, Grid.for_query(query, nodes, MARGIN))
         policy, value = solution.policy(), solution.value
-        again = []
-        guesses = list(state.guesses)
-        for i, extremal in enumerate(state.extremals):
-            known = extremal.cost if extremal is not None else np.inf
-            if guesses[i] is None or known > SUSPICION * float(value.value(state.starts[i])):
-                guesses[i] = None  # found anew with this grid when it is needed
-                again.append(Step(start=i))
-        todo = {s.start for s in state.pending}
-        again = [s for s in again if s.start not in todo]
-        better = nodes > state.worth_nodes or any(g is None for g in state.guesses)
+        expected = np.asarray(value.value(state.starts)) * SUSPICION
+        failed = any(loop is None for loop in state.loops)
+        loops, again = list(state.loops), []
+        todo = {step.start for step in state.pending}
+        for i, (loop, extremal) in enumerate(zip(state.loops, state.extremals, strict=True)):
+            known = extremal.cost if extremal is not None else loop.cost if loop else np.inf
+            if known > expected[i]:
+                loops[i] = None
+                if i not in todo:
+                    again.append(Step(start=i))
+        better = failed or nodes > state.worth_nodes
         return replace(
             state,
-            guesses=tuple(guesses),
+            loops=tuple(loops),
             base=(policy, value) if better else state.base,
             nodes=nodes if better else state.nodes,
             grid_policy=policy,
@@ -249,12 +268,13 @@ class MetaPlanner:
             state = replace(
                 state,
                 starts=np.vstack([state.starts, own]),
-                guesses=(*state.guesses, _loops(state.network, own[None])[0]),
+                loops=(*state.loops, *_loops(state.network, own[None])),
                 extremals=(*state.extremals, None),
             )
         if query.goal_distance(state.starts[i]) <= 0:
             return state
-        guess = state.guesses[i]
+        loop = state.loops[i]
+        guess = loop.motion(query) if loop is not None else None
         if guess is None and state.grid_policy is not None:
             guess = rollouts(query, state.grid_policy, state.starts[i])[0]
         if guess is None:
@@ -264,29 +284,19 @@ class MetaPlanner:
         best = known if known is not None and known.cost <= found.cost else found
         extremals = list(state.extremals)
         extremals[i] = best if best.trajectory is not None else None
-        guesses = list(state.guesses)
-        guesses[i] = guess
         return replace(
             state,
             extremals=tuple(extremals),
-            guesses=tuple(guesses),
             trajectories=state.trajectories + (found.trajectory is not None),
         )
 
 
-def _loops(network: NetworkValue, starts: Floats) -> tuple[Trajectory | None, ...]:
+def _loops(network: NetworkValue, starts: Floats) -> tuple[Loop | None, ...]:
     """The closed loops of a network's policy; `None` where one does not get to the goal."""
     if not len(starts):
         return ()
-    query = network.query
-    n, m = query.system.n, query.system.m
     path, steps = network.drive(starts, STRIDE, MOST_STEPS)
-    found: list[Trajectory | None] = []
-    for i, count in enumerate(steps):
-        if count < 1:
-            found.append(None)
-            continue
-        states = path[: count + 1, i, :n].copy()
-        durations, inputs = path[:count, i, n + m], path[:count, i, n : n + m]
-        found.append(timed(query, states, durations.copy(), inputs.copy()))
-    return tuple(found)
+    return tuple(
+        Loop(path[: count + 1, i].copy(), float(path[count, i, -1])) if count > 0 else None
+        for i, count in enumerate(steps)
+    )

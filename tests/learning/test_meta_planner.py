@@ -1,0 +1,121 @@
+"""The main method: a planner's laws, deadlines, and what the shipped weights promise."""
+
+import numpy as np
+import pytest
+
+from learning import MetaPlanner
+from learning.meta_planner import Clock, Step
+from learning.pretrained_weights import FOLDER, MOST_BYTES, load_pretrained
+from ocp import Goal, Obstacle, Query, SolveError, exact_trajectory, iterations, trajectories
+from ocp.family_file import load_family
+from ocp.query_family import PAPER_START, paper_query, sample_start
+from sims.closed_loop import LoopSettings, rollouts
+
+FAMILIES = ("paper", "general")
+LOOP = LoopSettings(time_limit=40.0)
+
+
+def aggregate_excess(policy, starts, optima):
+    """Closed-loop costs over optimal ones, minus 1; infinite if a loop does not end."""
+    loops = rollouts(policy, starts, LOOP)
+    costs = [np.inf if r.cost is None else r.cost for r in loops]
+    return float(np.sum(costs) / np.sum(optima) - 1)
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def problem(request):
+    """A query with an obstacle or more, four starts and their optimal costs."""
+    rng = np.random.default_rng(2_000_000)
+    family = load_family(request.param)
+    query = family.sample(rng)
+    while not query.obstacles:
+        query = family.sample(rng)
+    starts = [sample_start(query, rng) for _ in range(4)]
+    return request.param, query, starts, [exact_trajectory(query, x).cost for x in starts]
+
+
+def test_the_network_alone_is_near_the_optimum(problem):
+    name, query, starts, optima = problem
+    planned = MetaPlanner.pretrained(name, grids=False).plan(query, starts, iterations(0))
+    assert planned.trajectories == 0
+    # Held input costs some 1e-5; nothing is below the optimum.
+    assert -1e-4 < aggregate_excess(planned.policy, starts, optima) < 0.05
+
+
+def test_exact_trajectories_from_the_starts_asked_for_close_the_gap(problem):
+    name, query, starts, optima = problem
+    planned = MetaPlanner.pretrained(name).plan(query, starts, trajectories(8))
+    assert 4 <= planned.trajectories <= 8
+    assert -1e-4 < aggregate_excess(planned.policy, starts, optima) < 1e-3
+    for start, optimum in zip(starts, optima, strict=True):
+        assert float(planned.value.value(start)) == pytest.approx(optimum, rel=1e-3)
+
+
+def test_refinement_never_makes_the_answer_worse_and_keeps_its_argument(problem):
+    name, query, starts, optima = problem
+    planner = MetaPlanner.pretrained(name)
+    state = planner.start(query, starts)
+    before, pending = planner.policy(state), state.pending
+    worst = aggregate_excess(before, starts, optima)
+    for _ in range(6):
+        state_before, state = state, planner.refine(state)
+        assert state_before.tubes is not state.tubes or state.tubes is None
+    assert planner.policy(planner.start(query, starts)) is not before
+    assert pending == planner.start(query, starts).pending
+    assert aggregate_excess(planner.policy(state), starts, optima) < worst + 1e-4
+
+
+def test_no_starts_mean_the_whole_space(problem):
+    name, query, starts, optima = problem
+    planned = MetaPlanner.pretrained(name).plan(query, until=iterations(2))
+    assert aggregate_excess(planned.policy, starts, optima) < 0.05
+
+
+def test_a_step_is_not_begun_that_would_end_late():
+    """The rule sees the expected time of the next step, learned from those before."""
+    clock = Clock()
+    for _ in range(20):
+        clock.learn(Step(start=0), 0.5)
+        clock.learn(Step(nodes=10_000), 0.1)
+    assert clock.expected(Step(start=0)) >= 0.45
+    assert clock.expected(Step(nodes=20_000)) >= 0.15
+    state = MetaPlanner.pretrained("paper").start(paper_query((1.0, 4.0)), [np.array(PAPER_START)])
+    assert state.next_seconds > 0
+
+
+def test_without_obstacles_the_value_is_the_closed_form():
+    query = paper_query((4.0, 4.0))
+    planned = MetaPlanner.shipped().plan(query, until=iterations(0))
+    facing = np.array([0.5, 0.5, np.pi / 4])
+    assert float(planned.value.value(facing)) == pytest.approx(
+        exact_trajectory(query, facing).cost, rel=1e-4
+    )
+
+
+def test_each_query_gets_the_network_that_knows_it():
+    paper = load_pretrained("paper")
+    assert paper.knows(paper_query((1.0, 4.0)))
+    other = Query("unicycle", Goal((1.0, 4.0), 0.5), (Obstacle.circle((0, 0), 1.0),))
+    assert not paper.knows(other)
+    assert load_pretrained("general").knows(other)
+    with pytest.raises(SolveError, match="other queries"):
+        MetaPlanner.pretrained("paper").plan(other)
+    assert MetaPlanner.shipped().plan(other, until=iterations(0)).trajectories == 0
+
+
+def test_other_robots_are_refused():
+    with pytest.raises(SolveError, match="unicycle"):
+        MetaPlanner.shipped().plan(Query("rover", Goal((1.0, 1.0), 0.5)))
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_shipped_weights_are_small_and_say_where_they_come_from(name):
+    made = load_pretrained(name)
+    assert (FOLDER / f"{name}.safetensors").stat().st_size <= MOST_BYTES
+    for key in ("command", "data_sha256", "settings", "held_out"):
+        assert key in made.provenance
+
+
+def test_unknown_weights_are_refused():
+    with pytest.raises(ValueError, match="'mine' is unknown"):
+        MetaPlanner.pretrained("mine")
