@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from learning.adam import Moments, adam_step
 from learning.config import AdaptationSettings, Config, Optimizer
 from learning.faithful_data import sample_map
 from learning.losses import Samples, lagrangian_gradient
@@ -24,15 +25,6 @@ log = logging.getLogger(__name__)
 
 START_STREAM, SHOT_STREAM = 3, 4
 ATTEMPTS = 20  # starts without a verified trajectory before giving up
-
-
-@dataclass(frozen=True)
-class Moments:
-    """Adam's, for the departure `Optimizer.ADAM`."""
-
-    first: Parameters
-    second: Parameters
-    steps: int
 
 
 @dataclass(frozen=True)
@@ -140,21 +132,4 @@ def _stepped(
         if config.adaptation.optimizer is Optimizer.GRADIENT:
             moved = tuple(p - rate * g for p, g in zip(parameters, gradient, strict=True))
             return moved, None
-        return _adam(parameters, gradient, rate, moments)
-
-
-def _adam(
-    parameters: Parameters, gradient: Parameters, rate: float, moments: Moments | None
-) -> tuple[Parameters, Moments]:
-    """Adam (Kingma and Ba, 2015) with its usual constants, as a function of its state."""
-    if moments is None:
-        zeros = tuple(torch.zeros_like(p) for p in parameters)
-        moments = Moments(zeros, zeros, 0)
-    t = moments.steps + 1
-    first = tuple(0.9 * m + 0.1 * g for m, g in zip(moments.first, gradient, strict=True))
-    second = tuple(0.999 * v + 0.001 * g**2 for v, g in zip(moments.second, gradient, strict=True))
-    moved = tuple(
-        p - rate * (m / (1 - 0.9**t)) / ((v / (1 - 0.999**t)).sqrt() + 1e-8)
-        for p, m, v in zip(parameters, first, second, strict=True)
-    )
-    return moved, Moments(first, second, t)
+        return adam_step(parameters, gradient, rate, moments)

@@ -15,6 +15,9 @@ from ocp.query import Query
 from ocp.value import Policy, Value
 
 PRETRAINED = Path(__file__).parent / "pretrained" / "faithful.safetensors"
+"""theta_meta of configs/section-iv-b.toml."""
+REPAIRED = PRETRAINED.with_name("repaired.safetensors")
+"""theta_meta of configs/repaired.toml."""
 
 
 @dataclass(frozen=True)

@@ -4,21 +4,27 @@ It minimises the Lagrangian (12) over the grid's nodes by minibatches. No query 
 another: this is what meta learning is to spare.
 """
 
-import logging
-from dataclasses import dataclass, field
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from learning.adam import Moments, adam_step
 from learning.config import DataSettings, LossSettings, NetworkSettings
 from learning.faithful_data import supervision
 from learning.losses import Derivative, Lagrangian, Reduction, lagrangian_gradient
 from learning.meta_data import FeatureMap, QueryTable, SampleMap, Supervision
 from learning.network_value import NetworkValue
-from learning.value_network import Architecture, Parameters
+from learning.value_network import Architecture, Parameters, expanded
 from ocp.query import Query
+from ocp.trajectory import SolveError, Status
+from ocp.value import Policy, Value, greedy
 
-log = logging.getLogger(__name__)
+REFINEMENT = 100
+"""Steps of Adam between two looks at the clock."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,7 @@ class InterpolationSettings:
             reduction=Reduction.MEAN, derivative=Derivative.AUTOMATIC
         )
     )
-    steps: int = 3000
+    steps: int = 1500
     batch: int = 512
     rate: float = 2e-3
     seed: int = 0
@@ -58,41 +64,100 @@ class InterpolationSettings:
         )
 
 
-def interpolated_value(query: Query, settings: InterpolationSettings | None = None) -> NetworkValue:
-    """V^NN fitted to the set-valued solution of `query`.
+@dataclass(frozen=True)
+class Fit:
+    """A network part of the way to a query's data; never changed, only replaced.
 
-    Raises:
-        SolveError: if the set-valued method does not apply, or inputs are bounded.
-        ValueError: if the grid is too coarse for the goal.
+    Attributes:
+        query: what is interpolated.
+        table: its data.
+        settings: how.
+        parameters, moments: of the network, and Adam's.
+        losses: the Lagrangian at each step so far.
     """
-    settings = settings or InterpolationSettings()
-    data = supervision(query, settings.data, (settings.seed, 0))
-    parameters, _ = fitted(query, data, settings)
-    return NetworkValue(query, settings.network, parameters)
+
+    query: Query
+    table: QueryTable = field(repr=False)
+    settings: InterpolationSettings
+    parameters: Parameters = field(repr=False)
+    moments: Moments | None = field(default=None, repr=False)
+    losses: tuple[float, ...] = field(default=(), repr=False)
+
+    @property
+    def finished(self) -> bool:
+        return len(self.losses) >= self.settings.steps
+
+    @property
+    def value(self) -> NetworkValue:
+        return NetworkValue(self.query, self.settings.network, self.parameters)
 
 
-def fitted(
-    query: Query, data: Supervision, settings: InterpolationSettings
-) -> tuple[Parameters, list[float]]:
-    """Parameters that minimise the Lagrangian over `data`, and the loss of each step."""
+def begun(query: Query, data: Supervision, settings: InterpolationSettings) -> Fit:
+    """Before the first step: the mean value, and no more."""
     features = FeatureMap(query.system, settings.network.relative)
     tensors = SampleMap(features, settings.network.structure, settings.loss.difference_step)
-    table = QueryTable([query], [data], tensors)
     shape = Architecture(features.count, settings.network.hidden, settings.network.activation)
     parameters = shape.initial_parameters(torch.Generator().manual_seed(settings.seed))
-    # V is some ten times larger than a network's first output: begin at the mean.
+    # V is some ten times larger than a network's first output.
     parameters[-1].fill_(float(data.values.mean()))
-    form = settings.lagrangian
-    rng = np.random.default_rng(settings.seed)
-    optimizer = torch.optim.Adam(parameters, lr=settings.rate)
-    losses = []
-    for step in range(settings.steps):
-        (samples,) = table.draw(rng, 1, (min(settings.batch, len(data)),))
-        batched = tuple(p[None] for p in parameters)
-        outcome = lagrangian_gradient(batched, samples, form)
-        for p, g in zip(parameters, outcome.gradient, strict=True):
-            p.grad = g[0]
-        optimizer.param_groups[0]["lr"] = settings.rate * (1 - step / settings.steps)
-        optimizer.step()
+    return Fit(query, QueryTable([query], [data], tensors), settings, parameters)
+
+
+def advanced(fit: Fit, steps: int) -> Fit:
+    """`steps` steps on, or to the end."""
+    settings, form = fit.settings, fit.settings.lagrangian
+    parameters, moments, losses = fit.parameters, fit.moments, list(fit.losses)
+    shots = min(settings.batch, len(fit.table.data[0]))
+    for step in range(len(losses), min(len(losses) + steps, settings.steps)):
+        rng = np.random.default_rng([settings.seed, step])
+        (samples,) = fit.table.draw(rng, 1, (shots,))
+        outcome = lagrangian_gradient(expanded(parameters, 1), samples, form)
+        gradient = tuple(g[0] for g in outcome.gradient)
+        rate = settings.rate * (1 - step / settings.steps)
+        parameters, moments = adam_step(parameters, gradient, rate, moments)
         losses.append(float((outcome.value + form.multiplier * outcome.control)[0]))
-    return parameters, losses
+    return replace(fit, parameters=parameters, moments=moments, losses=tuple(losses))
+
+
+@dataclass(frozen=True)
+class InterpolationState:
+    """A fit, and how long the last refinement took."""
+
+    fit: Fit
+    next_seconds: float = 0.0
+    trajectories: int = 0
+
+    @property
+    def finished(self) -> bool:
+        return self.fit.finished
+
+
+@dataclass(frozen=True)
+class InterpolationPlanner:
+    """The interpolating network as a planner; a refinement is `REFINEMENT` steps of Adam."""
+
+    settings: InterpolationSettings = field(default_factory=InterpolationSettings)
+
+    def start(self, query: Query, _starts: Sequence[NDArray[np.float64]]) -> InterpolationState:
+        """The set-valued solution, and the first steps.
+
+        Raises:
+            SolveError: if the set-valued method does not apply, or inputs are bounded.
+            ValueError: if the grid is too coarse for the goal.
+        """
+        if query.is_bounded:
+            raise SolveError(Status.NOT_APPLICABLE, "the losses need unbounded inputs")
+        settings = self.settings
+        data = supervision(query, settings.data, (settings.seed, 0))
+        return self.refine(InterpolationState(begun(query, data, settings)))
+
+    def refine(self, state: InterpolationState) -> InterpolationState:
+        began = time.perf_counter()
+        fit = advanced(state.fit, REFINEMENT)
+        return InterpolationState(fit, time.perf_counter() - began)
+
+    def policy(self, state: InterpolationState) -> Policy:
+        return greedy(state.fit.query, state.fit.value)
+
+    def value(self, state: InterpolationState) -> Value:
+        return state.fit.value

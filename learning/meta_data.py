@@ -7,7 +7,7 @@ From the set-valued method on a grid (eq. (8)), from exact trajectories sampled 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -170,6 +170,12 @@ class DistanceBound:
         return gradient
 
 
+@lru_cache(maxsize=256)
+def distance_bound(query: Query) -> DistanceBound:
+    """The bound of a query, tabulated once."""
+    return DistanceBound(query)
+
+
 @dataclass(frozen=True)
 class SampleMap:
     """Supervision of one query as tensors that the losses take.
@@ -212,7 +218,7 @@ class SampleMap:
         references = np.stack([query.reference for query in queries])
         bounds, slopes = np.zeros((len(queries), 0)), np.zeros((len(queries), 0))
         if self.structure is Structure.BOUND:
-            exact = [DistanceBound(query) for query in queries]
+            exact = [distance_bound(query) for query in queries]
             bounds = np.stack([b.value(x) for b, x in zip(exact, states, strict=True)])
             gradients = np.stack([b.gradient(x) for b, x in zip(exact, states, strict=True)])
             slopes = (along * gradients[:, :, None, :]).sum(-1)

@@ -29,6 +29,7 @@ from learning.value_network import Activation
 from ocp.pontryagin import exact_trajectory
 from ocp.query import Query
 from ocp.query_family import PAPER_FAMILY, sample_start
+from ocp.set_valued import COARSE
 from ocp.trajectory import SolveError, Trajectory
 from ocp.value import greedy
 from sims.closed_loop import LoopSettings, rollouts
@@ -38,7 +39,7 @@ log = logging.getLogger(__name__)
 FRESH_STREAM = 99
 COUNTS = (0, 1, 2, 4, 8, 16, 32, 64)
 """Trajectories after which the policy is judged."""
-LOOP = LoopSettings(period=0.05, time_limit=60.0, substeps=2)
+LOOP = LoopSettings(period=0.1, time_limit=40.0)
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,8 @@ def evaluate(
 def _costs(policy: Any, starts: NDArray[np.float64]) -> NDArray[np.float64]:
     """Closed-loop costs `[k]`; NaN where the goal is not reached or the loop blows up."""
     try:
-        loops = rollouts(policy, list(starts), LOOP)
+        with np.errstate(all="ignore"):  # a diverged network overflows; `rollouts` then raises
+            loops = rollouts(policy, list(starts), LOOP)
     except FloatingPointError:  # a far excursion overflows: judge the starts one by one
         if len(starts) == 1:
             return np.array([np.nan])
@@ -231,20 +233,28 @@ def _percent(number: float | None) -> str:
 # Ablations
 
 CHANGES: dict[str, dict[str, dict[str, Any]]] = {
-    "as printed": {},
+    "none": {},
+    "sums": {"loss": {"reduction": Reduction.SUM}},
     "means": {"loss": {"reduction": Reduction.MEAN}},
     "finite differences": {"loss": {"derivative": Derivative.FINITE}},
-    "smooth activation": {"network": {"activation": Activation.SILU}},
+    "mu = 0.1": {"loss": {"multiplier": 0.1}},
+    "mu = 1": {"loss": {"multiplier": 1.0}},
+    "relu": {"network": {"activation": Activation.RELU}},
+    "silu": {"network": {"activation": Activation.SILU}},
+    "absolute positions": {"network": {"relative": False}},
     "relative positions": {"network": {"relative": True}},
+    "plain structure": {"network": {"structure": Structure.PLAIN}},
     "bound structure": {"network": {"structure": Structure.BOUND}},
+    "alpha = 0.001": {"meta": {"inner_rate": 1e-3}},
     "three inner steps": {"meta": {"inner_steps": 3}},
     "first order": {"meta": {"second_order": False}},
     "no inner step": {"meta": {"inner_steps": 0}},
-    "Adam in the adaptation": {"adaptation": {"optimizer": Optimizer.ADAM}},
-    "better data": {"data": {"source": Source.EIKONAL}},
-    "mu = 10": {"loss": {"multiplier": 10.0}},
+    "Adam in the adaptation": {"adaptation": {"optimizer": Optimizer.ADAM, "rate": 1e-3}},
+    "set-valued data": {"data": {"source": Source.SET_VALUED, "grid": COARSE}},
+    "eikonal data": {"data": {"source": Source.EIKONAL}},
+    "trajectories as data": {"data": {"source": Source.TRAJECTORIES}},
 }
-"""One change at a time, by name: section of the configuration, fields, new values."""
+"""Single changes by name: section of the configuration, fields, new values."""
 
 
 def changed(config: Config, change: dict[str, dict[str, Any]]) -> Config:
@@ -260,17 +270,19 @@ class Evaluate:
 
     weights: tyro.conf.Positional[tuple[Path, ...]]
     """Weights files or checkpoints."""
+    counts: tuple[int, ...] = COUNTS
+    """Trajectories after which to judge."""
     queries: int = 20
     starts: int = 10
     seed: int = 0
     json: bool = False
 
     def run(self) -> None:
-        trials = fresh_trials(self.seed, self.queries, self.starts, max(COUNTS))
+        trials = fresh_trials(self.seed, self.queries, self.starts, max(self.counts))
         for path in self.weights:
             weights = MetaWeights.load(path)
             title = f"{path}: {weights.iterations} meta-iterations"
-            show(evaluate(weights, trials), title, self.json)
+            show(evaluate(weights, trials, self.counts), title, self.json)
 
 
 @dataclass(frozen=True)
@@ -280,21 +292,30 @@ class Ablate:
     config: tyro.conf.Positional[Path]
     """The configuration that is changed."""
     out: Path
-    """Folder for weights and figures."""
+    """Folder for weights; a run that was stopped goes on."""
     changes: tuple[str, ...] = tuple(CHANGES)
-    iterations: int = 1000
-    queries: int = 10
+    """Names in `CHANGES`, one training each."""
+    hidden: tuple[int, ...] = ()
+    """Widths instead of the configuration's."""
+    iterations: int = 0
+    """Meta-iterations instead of the configuration's."""
+    counts: tuple[int, ...] = (0, 4, 16)
+    """Trajectories after which to judge."""
+    queries: int = 8
     starts: int = 10
     seed: int = 0
     json: bool = False
 
     def run(self) -> None:
-        base = Config.load(self.config)
-        base = replace(base, meta=replace(base.meta, iterations=self.iterations))
-        trials = fresh_trials(self.seed, self.queries, self.starts, max(COUNTS))
         for name in self.changes:
             if name not in CHANGES:
                 raise ValueError(f"changes: {name!r} is unknown; known are {', '.join(CHANGES)}")
+        base = Config.load(self.config)
+        if self.iterations:
+            base = changed(base, {"meta": {"iterations": self.iterations}})
+        if self.hidden:
+            base = changed(base, {"network": {"hidden": self.hidden}})
+        trials = fresh_trials(self.seed, self.queries, self.starts, max(self.counts))
         for name in self.changes:
             config = changed(base, CHANGES[name])
             try:
@@ -302,7 +323,7 @@ class Ablate:
             except FloatingPointError as error:
                 print(f"{name}: {error}")
                 continue
-            show(evaluate(MetaWeights.load(path), trials), name, self.json)
+            show(evaluate(MetaWeights.load(path), trials, self.counts), name, self.json)
 
 
 def show(rows: Sequence[Row], title: str, as_json: bool) -> None:

@@ -8,11 +8,18 @@ import torch
 
 from learning.config import DataSettings, LossSettings, NetworkSettings
 from learning.faithful_data import supervision
-from learning.interpolation import InterpolationSettings, fitted, interpolated_value
+from learning.interpolation import (
+    InterpolationPlanner,
+    InterpolationSettings,
+    advanced,
+    begun,
+)
 from learning.losses import Derivative, Reduction
 from learning.value_network import Activation
 from ocp.compiled.batch import optimal_inputs
+from ocp.planning import iterations, plan
 from ocp.query_family import paper_query
+from ocp.trajectory import SolveError
 
 QUERY = paper_query((4.0, 4.0))
 SETTINGS = InterpolationSettings(
@@ -32,7 +39,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def value():
-    return interpolated_value(QUERY, SETTINGS)
+    return plan(InterpolationPlanner(SETTINGS), QUERY, until=iterations(100)).value
 
 
 def test_the_network_comes_near_the_values_it_was_shown(data, value) -> None:
@@ -53,9 +60,22 @@ def test_the_control_follows_the_one_it_was_shown(data, value) -> None:
 
 def test_the_loss_falls_and_equal_seeds_agree(data) -> None:
     short = replace(SETTINGS, steps=50)
-    first, losses = fitted(QUERY, data, short)
-    again, _ = fitted(QUERY, data, short)
-    assert np.median(losses[-10:]) < 0.5 * np.median(losses[:10])
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    other, _ = fitted(QUERY, data, replace(short, seed=1))
-    assert not torch.equal(first[0], other[0])
+    whole = advanced(begun(QUERY, data, short), 50)
+    assert whole.finished
+    assert np.median(whole.losses[-10:]) < 0.5 * np.median(whole.losses[:10])
+    half = advanced(begun(QUERY, data, short), 20)
+    assert not half.finished
+    losses = half.losses
+    parts = advanced(half, 1000)
+    assert half.losses == losses
+    assert len(parts.losses) == 50
+    for a, b in zip(whole.parameters, parts.parameters, strict=True):
+        assert torch.equal(a, b)
+    other = advanced(begun(QUERY, data, replace(short, seed=1)), 50)
+    assert not torch.equal(whole.parameters[0], other.parameters[0])
+
+
+def test_bounded_inputs_are_refused() -> None:
+    bounded = replace(QUERY, input_lower=(-1.0, -1.0))
+    with pytest.raises(SolveError, match="unbounded"):
+        InterpolationPlanner(SETTINGS).start(bounded, [])
