@@ -26,20 +26,25 @@ class Sighting:
     Attributes:
         key: the same whenever the same obstacle is seen.
         solid: where it is now. Its whole shape is known as soon as some part of it is seen.
+        mobile: whether it drives by itself, as other robots do, although it may be standing now.
     """
 
     key: int
     solid: Solid
+    mobile: bool = False
 
 
 @dataclass(eq=False)
 class _Known:
-    handle: int
+    handle: int | None
     solid: Solid
     planned: Array
     seen: float
-    velocity: Array
+    velocity: Array = field(default_factory=lambda: np.zeros(0))
     unsteady: float = -np.inf
+
+    def __post_init__(self) -> None:
+        self.velocity = np.zeros_like(self.planned)
 
 
 @dataclass
@@ -65,20 +70,24 @@ class Perceived:
 
     A standing obstacle that is not where it was although it should be seen has vanished. An
     obstacle's velocity is the difference of two sightings; at the first it is taken as standing.
+    Another robot that covers this one's goal is kept from the planner, which would find no route
+    and wait for ever for somebody who may be waiting too; forecasts still keep clear of it.
     """
 
-    def __init__(self, dimension: int, radius: float, growth: float) -> None:
+    def __init__(self, goal: Array, body: float, radius: float, growth: float) -> None:
         """Perception up to `radius` metres.
 
         Args:
-            dimension: d.
+            goal: `[d]`, of this robot.
+            body: radius of this robot and its comfort, metres.
             radius: of the perception, metres.
             growth: metres a second by which a body is extended in forecasts while it changes its
                 velocity: what it will do is then not known.
         """
+        self._goal, self._body = goal, body
         self._radius, self._growth = radius, growth
         self._known: dict[int, _Known] = {}
-        self.surroundings = Surroundings(dimension)
+        self.surroundings = Surroundings(len(goal))
 
     @property
     def known(self) -> list[tuple[int, Solid]]:
@@ -98,32 +107,28 @@ class Perceived:
             seen.add(sighting.key)
             known = self._known.get(sighting.key)
             if known is None:
-                changes.add.append((sighting.key, sighting.solid))
-                continue
-            if sighting.solid is not known.solid:
+                known = _Known(None, sighting.solid, sighting.solid.center.copy(), time)
+                self._known[sighting.key] = known
+            elif sighting.solid is not known.solid:
                 self._follow(known, sighting.solid, time)
             elif known.velocity.any():
                 known.velocity = np.zeros_like(known.velocity)
                 known.unsteady = time
             known.seen = time
-            shift = known.solid.center - known.planned
-            if np.linalg.norm(shift) > STEP:
-                changes.move[known.handle] = shift
-                known.planned = known.solid.center.copy()
+            self._tell(sighting, known, changes)
         for key, known in list(self._known.items()):
             if key in seen:
                 continue
             moving = np.linalg.norm(known.velocity) > STILL
             if moving or self._should_be_seen(known.solid, position):
-                changes.remove.append(known.handle)
+                if known.handle is not None:
+                    changes.remove.append(known.handle)
                 del self._known[key]
         return changes
 
-    def remember(self, key: int, solid: Solid, handle: int, time: float) -> None:
-        """The planner knows a new obstacle by this handle."""
-        self._known[key] = _Known(
-            handle, solid, solid.center.copy(), time, np.zeros_like(solid.center)
-        )
+    def remember(self, key: int, handle: int) -> None:
+        """The planner knows an obstacle by this handle."""
+        self._known[key].handle = handle
 
     def refresh(self, time: float) -> None:
         """Bring `surroundings` up to date."""
@@ -135,6 +140,24 @@ class Perceived:
     def clearance(self, position: Array) -> float:
         """Metres from `position` `[d]` to the nearest obstacle known; `FAR` if there is none."""
         return float(self.surroundings.clearances(position[None, None], 1.0, 1.0)[0])
+
+    def _tell(self, sighting: Sighting, known: _Known, changes: Changes) -> None:
+        """What the planner has to be told of an obstacle that is seen."""
+        solid = known.solid
+        near = float(np.linalg.norm(solid.center - self._goal)) - solid.reach <= self._body
+        if sighting.mobile and near:
+            if known.handle is not None:
+                changes.remove.append(known.handle)
+                known.handle = None
+            return
+        if known.handle is None:
+            changes.add.append((sighting.key, solid))
+            known.planned = solid.center.copy()
+            return
+        shift = solid.center - known.planned
+        if np.linalg.norm(shift) > STEP:
+            changes.move[known.handle] = shift
+            known.planned = solid.center.copy()
 
     def _follow(self, known: _Known, solid: Solid, time: float) -> None:
         velocity = (solid.center - known.solid.center) / (time - known.seen)

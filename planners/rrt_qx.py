@@ -272,7 +272,9 @@ class Navigator:
             padding=padding,
             horizon=max(2 * padding, 1.5),
         )
-        self.perceived = Perceived(d, settings.perception_radius, settings.growth)
+        self.perceived = Perceived(
+            self._goal, max(padding, SHORTEST), settings.perception_radius, settings.growth
+        )
         self.replans: list[Replan] = []
         self.phase, self.reason = Phase.LEARNING, ""
         self._update: Update = self.planner.construction
@@ -335,8 +337,8 @@ class Navigator:
             move=changes.move,
             robot=inside,
         )
-        for (key, solid), handle in zip(changes.add, self._update.handles, strict=True):
-            self.perceived.remember(key, solid, handle, time)
+        for (key, _), handle in zip(changes.add, self._update.handles, strict=True):
+            self.perceived.remember(key, handle)
         self.perceived.refresh(time)
         return bool(changes)
 

@@ -196,7 +196,7 @@ def drive(
     stopping: Array,
     recorders: Sequence[Recorder | None],
 ) -> Drive:
-    """Run a scenario in Drake's Simulator until all arrived, one collided or was lost, or time is up.
+    """Run a scenario in Drake, until all arrived, one collided or was lost, or time is up.
 
     Args:
         scenario: the world and its robots.

@@ -204,7 +204,7 @@ class Eyes(LeafSystem):
             elif robot != self._own:
                 body = max(self._robots[robot].radius, LEAST_BODY)
                 center = states[self._places[robot]][: self._d]
-                seen.append(Sighting(-1 - robot, Solid.ball(center, body)))
+                seen.append(Sighting(-1 - robot, Solid.ball(center, body), mobile=True))
         out.set_value(sorted(seen, key=lambda s: s.key))
 
 

@@ -12,6 +12,7 @@ from planners.solids import Solid
 from planners.world import SceneWorld
 
 PERIOD = 0.05
+FAR_GOAL = np.array([50.0, 50.0])
 
 
 def leg():
@@ -154,14 +155,14 @@ def test_an_obstacle_is_met_where_it_will_be():
 
 
 def test_perception_remembers_what_stands_and_forgets_what_moves():
-    perceived = Perceived(2, 5.0, 0.5)
+    perceived = Perceived(FAR_GOAL, 0.5, 5.0, 0.5)
     here = np.zeros(2)
     post, walker = Solid.ball([3.0, 0.0], 0.5), Solid.ball([0.0, 3.0], 0.5)
     for k in range(3):
         walker = walker.moved([0.1, 0.0])
         changes = perceived.look(PERIOD * k, here, [Sighting(1, post), Sighting(2, walker)])
-        for key, solid in changes.add:
-            perceived.remember(key, solid, key, PERIOD * k)
+        for key, _ in changes.add:
+            perceived.remember(key, key)
     assert perceived.moving
     away = np.array([-20.0, 0.0])
     assert perceived.look(1.0, away, []).remove == [2]
@@ -169,26 +170,41 @@ def test_perception_remembers_what_stands_and_forgets_what_moves():
 
 
 def test_perception_notices_that_what_stood_is_gone():
-    perceived = Perceived(2, 5.0, 0.5)
+    perceived = Perceived(FAR_GOAL, 0.5, 5.0, 0.5)
     post = Solid.ball([3.0, 0.0], 0.5)
     perceived.look(0.0, np.zeros(2), [Sighting(1, post)])
-    perceived.remember(1, post, 11, 0.0)
+    perceived.remember(1, 11)
     assert perceived.look(0.05, np.zeros(2), []).remove == [11]
     assert perceived.known == []
 
 
 def test_a_body_that_changes_its_velocity_is_foretold_larger():
-    perceived = Perceived(2, 9.0, 0.5)
+    perceived = Perceived(FAR_GOAL, 0.5, 9.0, 0.5)
     here, walker = np.array([3.0, 0.0]), Solid.ball([0.0, 0.0], 0.5)
     still = np.broadcast_to(here, (1, 21, 2))
     found = []
     for step in ([0.0, 0.0], [0.0, 0.05], [0.0, 0.05], [0.03, 0.02]):
         walker = walker.moved(step)
         time = PERIOD * len(found)
-        for key, solid in perceived.look(time, here, [Sighting(1, walker)]).add:
-            perceived.remember(key, solid, 0, time)
+        for key, _ in perceived.look(time, here, [Sighting(1, walker)]).add:
+            perceived.remember(key, 0)
         perceived.refresh(time)
         found.append(perceived.surroundings.clearances(still, PERIOD, 1.0)[0])
     assert found[0] == pytest.approx(2.5, abs=0.02)
     # It turned towards the robot at 0.6 m/s, and may do more: 0.5 m/s of growth for one second.
     assert found[-1] == pytest.approx(2.5 - 0.03 - 0.6 - 0.5, abs=0.05)
+
+
+def test_another_robot_on_the_goal_is_kept_from_the_planner_but_not_from_forecasts():
+    perceived = Perceived(np.zeros(2), 0.5, 9.0, 0.5)
+    other = Solid.ball([0.3, 0.0], 0.3)
+    here = np.array([3.0, 0.0])
+    assert perceived.look(0.0, here, [Sighting(-1, other, mobile=True)]).add == []
+    perceived.refresh(0.0)
+    assert perceived.clearance(here) == pytest.approx(2.4)
+    gone = other.moved([2.0, 0.0])
+    assert [k for k, _ in perceived.look(0.1, here, [Sighting(-1, gone, mobile=True)]).add] == [-1]
+    perceived.remember(-1, 5)
+    assert perceived.look(0.2, here, [Sighting(-1, other, mobile=True)]).remove == [5]
+    # What does not drive by itself is an obstacle wherever it is.
+    assert [k for k, _ in perceived.look(0.3, here, [Sighting(2, other)]).add] == [2]
