@@ -1,7 +1,9 @@
 """What the experiments measure: exact optima, and one plan with its closed loops, as plain data."""
 
+import logging
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,8 @@ from sims.closed_loop import LoopSettings, Rollout, rollouts
 from sims.experiments.contestants import Contestant
 from sims.experiments.paper import GOALS
 from sims.experiments.parts import Parts
+
+log = logging.getLogger(__name__)
 
 Start = Sequence[float]
 POINTS = 200  # of a stored path
@@ -46,13 +50,14 @@ def path(motion: Trajectory) -> list[list[float]]:
 
 def rehearse(contestant: Contestant, query: Query | None = None) -> None:
     """Load compiled code and weights: solve another query of the same kind, not counted."""
-    from dataclasses import replace
-
     query = query or paper_query((4.0, 4.0))
     center = tuple(0.98 * float(x) for x in query.goal_position)
     other = replace(query, goal=Goal(center, query.goal.radius))
-    answer = plan(contestant.planner(), other, [PAPER_START], contestant.until)
-    answer.policy(np.array(PAPER_START))
+    try:
+        answer = plan(contestant.planner(), other, [PAPER_START], contestant.until)
+        answer.policy(np.array(PAPER_START))
+    except SolveError:  # the query proper will say so again
+        log.debug("rehearsal of %s ended without an answer", contestant.key)
 
 
 def planned(contestant: Contestant, query: Query, starts: Sequence[Start]) -> tuple[Plan, float]:
