@@ -25,6 +25,7 @@ BENCHMARKS: dict[str, str] = {
     "robots": "robots from SDF and URDF: evaluation and transcription, against Drake",
     "rrtx": "RRT^X: repair after changes, against growth from scratch, OMPL and the optimum",
     "store": "value store: time and bytes an entry, kills survived",
+    "learning": "adapt on fresh queries of three families against exact costs, and against time",
 }
 """Name of the module in this folder, and what it measures."""
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 DEMOS: dict[str, str] = {
     "four-queries": "the four queries of Xu and Zhu's Table I, the exact optimum beside",
     "replanning": "RRT^X repairs its route while obstacles appear, move and vanish",
+    "revealed-goals": "goals arrive while the robot drives; it waits for no policy",
 }
 """Name of the module in this folder, and what it shows."""
 
