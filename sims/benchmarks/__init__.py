@@ -14,12 +14,14 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 BENCHMARKS: dict[str, str] = {
+    "brackets": "certified brackets of the optimal cost: how many hold, how wide they are",
     "deadlines": "how late plans are ready against their deadline, over 10,000 calls",
     "exact": "exact costs, closed form, success and time of exact trajectories",
     "execution": "speed-up of two workers, what Dask adds a task, worker deaths survived",
     "faithful": "the paper's meta value learning, as printed and repaired, on fresh queries",
     "grids": "eikonal and set-valued grids: time, value error, closed-loop excess",
     "lqr": "analytic LQR: Riccati, matrix exponential, collocation and PMP",
+    "navigation": "RRT-Q^X: random dynamic scenarios, rules, crowds, several robots (hours)",
     "orders": "orders of convergence of the grid schemes, on and off the axis",
     "refmm": "ReFMM: orders, refined against uniform meshes, repair against a new solve",
     "robots": "robots from SDF and URDF: evaluation and transcription, against Drake",

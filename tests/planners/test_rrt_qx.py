@@ -68,7 +68,7 @@ class World:
 
     def __init__(self, rules=FLOWING, solids=(), glider=None, **settings):
         self.glider = Glider() if glider is None else glider
-        self.solids = dict(enumerate(solids))
+        self.solids, self.scenes = dict(enumerate(solids)), {}
         self.state = np.array([*START, 0.0, 0.0])
         own = NavigatorSettings(
             rules=rules,
@@ -79,18 +79,20 @@ class World:
         self.navigator = Navigator([-10, -10], [10, 10], self.state, GOAL, self.glider, own)
         self.time, self.track, self.orders = 0.0, [self.state.copy()], []
 
+    def away(self):
+        """Drake's distance to each solid, by key."""
+        found = {}
+        for key, solid in self.solids.items():
+            if id(solid) not in self.scenes:
+                self.scenes[id(solid)] = solid, SceneWorld([-10, -10], [10, 10], [solid])
+            found[key] = float(self.scenes[id(solid)][1].distances(self.state[:2]).distance)
+        return found
+
     def clearance(self):
-        if not self.solids:
-            return np.inf
-        scene = SceneWorld([-10, -10], [10, 10], list(self.solids.values()))
-        return float(scene.distances(self.state[:2]).distance) - 0.2
+        return min(self.away().values(), default=np.inf) - 0.2
 
     def seen(self):
-        radius = self.navigator.settings.perception_radius
-        away = {
-            key: float(SceneWorld([-10, -10], [10, 10], [s]).distances(self.state[:2]).distance)
-            for key, s in self.solids.items()
-        }
+        radius, away = self.navigator.settings.perception_radius, self.away()
         return [Sighting(k, s) for k, s in self.solids.items() if away[k] <= radius]
 
     def go(self, seconds, until=None):
