@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from learning.adaptation import Adaptation, adapt_once
 from learning.meta import MetaWeights
+from learning.meta_data import goal_ball
 from learning.network_value import GradientPolicy, NetworkValue
 from ocp.query import Query
 from ocp.value import Policy, Value
@@ -67,12 +68,15 @@ class FaithfulPlanner:
         """
         return cls(MetaWeights.load(PRETRAINED), seed)
 
-    def start(self, query: Query, _starts: Sequence[NDArray[np.float64]]) -> FaithfulState:
-        """The meta value function itself.
+    def start(self, query: Query, starts: Sequence[NDArray[np.float64]]) -> FaithfulState:
+        """The meta value function itself, for the whole space.
 
         Raises:
             ValueError: if the weights are of another robot.
+            SolveError: NOT_APPLICABLE if the goal is no ball.
         """
+        del starts  # Algorithm 2 draws its own
+        goal_ball(query)
         trained = self.weights.robot
         if query.system.fingerprint != trained.fingerprint:
             raise ValueError(

@@ -16,7 +16,7 @@ from learning.adam import Moments, adam_step
 from learning.config import DataSettings, LossSettings, NetworkSettings
 from learning.faithful_data import supervision
 from learning.losses import Derivative, Lagrangian, Reduction, lagrangian_gradient
-from learning.meta_data import FeatureMap, QueryTable, SampleMap, Supervision
+from learning.meta_data import FeatureMap, QueryTable, SampleMap, Supervision, goal_ball
 from learning.network_value import NetworkValue
 from learning.value_network import Architecture, Parameters, expanded
 from ocp.query import Query
@@ -138,13 +138,15 @@ class InterpolationPlanner:
 
     settings: InterpolationSettings = field(default_factory=InterpolationSettings)
 
-    def start(self, query: Query, _starts: Sequence[NDArray[np.float64]]) -> InterpolationState:
+    def start(self, query: Query, starts: Sequence[NDArray[np.float64]]) -> InterpolationState:
         """The set-valued solution, and the first steps.
 
         Raises:
             SolveError: if the set-valued method does not apply, or inputs are bounded.
             ValueError: if the grid is too coarse for the goal.
         """
+        del starts  # the whole space is interpolated
+        goal_ball(query)
         if query.is_bounded:
             raise SolveError(Status.NOT_APPLICABLE, "the losses need unbounded inputs")
         settings = self.settings

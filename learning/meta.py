@@ -118,7 +118,8 @@ def _chunk_gradient(
 
     for _ in range(steps):
         if second_order:
-            direction, pull, loss = vjp(gradient, fast, has_aux=True)
+            found: tuple[Any, Any, Any] = vjp(gradient, fast, has_aux=True)  # pyright: ignore[reportAssignmentType]
+            direction, pull, loss = found
             pulls.append(pull)
         else:
             direction, loss = gradient(fast)

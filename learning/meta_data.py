@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from learning.losses import Samples, Structure
 from ocp.compiled.batch import rates, state_costs
-from ocp.query import Query
+from ocp.query import Goal, Query
 from ocp.system import System
 from ocp.trajectory import SolveError, Status, Trajectory
 
@@ -69,14 +69,25 @@ def along_trajectory(query: Query, motion: Trajectory, interval: float) -> Super
 
 def in_goal(query: Query, count: int, rng: np.random.Generator) -> Supervision:
     """`count` states uniform in the goal region, where V = 0 and u = 0."""
-    system = query.system
+    system, goal = query.system, goal_ball(query)
     states = rng.uniform(system.lower, system.upper, (count, system.n))
     d = len(system.position)
     offsets = rng.normal(size=(count, d))
     offsets /= np.linalg.norm(offsets, axis=1, keepdims=True)
-    radii = query.goal.radius * rng.uniform(size=(count, 1)) ** (1 / d)
-    states[:, list(system.position)] = np.array(query.goal.center) + radii * offsets
+    radii = goal.radius * rng.uniform(size=(count, 1)) ** (1 / d)
+    states[:, list(system.position)] = np.array(goal.center) + radii * offsets
     return Supervision(states, np.zeros(count), np.zeros((count, system.m)))
+
+
+def goal_ball(query: Query) -> Goal:
+    """The goal as a ball of positions.
+
+    Raises:
+        SolveError: NOT_APPLICABLE if the query's goal is an equilibrium.
+    """
+    if not isinstance(query.goal, Goal):
+        raise SolveError(Status.NOT_APPLICABLE, "meta value learning needs a goal ball")
+    return query.goal
 
 
 @dataclass(frozen=True)
@@ -137,15 +148,16 @@ class DistanceBound:
     """
 
     def __init__(self, query: Query) -> None:
-        system, radius = query.system, query.goal.radius
-        free = Query(query.model, query.goal, (), query.cost)
+        system, goal = query.system, goal_ball(query)
+        radius = goal.radius
+        free = Query(query.model, goal, (), query.cost)
         d = len(system.position)
         extent = (system.upper - system.lower)[list(system.position)]
         reach = float(np.linalg.norm(extent)) + radius
         # d = r_g + s^2 removes the square root at the boundary.
         root = np.linspace(0.0, np.sqrt(reach), BOUND_KNOTS)
         states = np.zeros((BOUND_KNOTS, system.n))
-        states[:, list(system.position)] = np.array(query.goal.center)
+        states[:, list(system.position)] = np.array(goal.center)
         states[:, system.position[0]] += radius + root**2
         slope = 2 * np.sqrt(np.maximum(state_costs(free, states), 0.0))
         steps = np.diff(root) * (slope[1:] * root[1:] + slope[:-1] * root[:-1])
@@ -163,7 +175,7 @@ class DistanceBound:
         query = self._query
         distance = np.maximum(query.goal_distance(states), 0.0)
         slope = np.interp(np.sqrt(distance), np.sqrt(self._distances), self._slopes)
-        offset = query.position(states) - np.array(query.goal.center)
+        offset = query.position(states) - np.array(goal_ball(query).center)
         unit = offset / np.maximum(np.linalg.norm(offset, axis=-1, keepdims=True), 1e-12)
         gradient = np.zeros(states.shape)
         gradient[..., list(query.system.position)] = slope[..., None] * unit

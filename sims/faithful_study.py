@@ -147,11 +147,9 @@ def evaluate(
                 results[n].append((lost, lost, lost))
                 continue
             value = NetworkValue(query, weights.config.network, adaptation.parameters)
-            costs = [
-                _costs(policy, trial.starts)
-                for policy in (GradientPolicy(query, value), greedy(query, value))
-            ]
-            results[n].append((value.value(trial.starts), *costs))
+            paper = _costs(GradientPolicy(query, value), trial.starts)
+            direction = _costs(greedy(query, value), trial.starts)
+            results[n].append((value.value(trial.starts), paper, direction))
         log.info("evaluated query %d of %d", i + 1, len(trials))
     optima = np.concatenate([t.optima for t in trials])
     rows = []
