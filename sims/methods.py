@@ -129,6 +129,12 @@ def _mpc_value() -> OneShot:
     return OneShot(solve)
 
 
+def _interpolation() -> Planner:
+    from learning.interpolation import InterpolationPlanner
+
+    return InterpolationPlanner()
+
+
 def _value_iteration() -> OneShot:
     from ocp.grids.lookahead import LookaheadPolicy
     from ocp.grids.regulation_grid import solve_regulation_grid
@@ -150,6 +156,9 @@ METHODS: dict[str, Method] = {
         "to an equilibrium: value iteration on a grid, up to 4 states", _value_iteration
     ),
     "set-valued": Method("the set-valued method of Xu and Zhu on its coarse grid", _set_valued),
+    "interpolation": Method(
+        "a network fitted to the set-valued solution of this one query", _interpolation
+    ),
     "mpc": Method("receding horizon of 2 s, quadratic cost at its end", _mpc, 0.1),
     "mpc-value": Method("receding horizon of 2 s, the eikonal value at its end", _mpc_value, 0.1),
 }
