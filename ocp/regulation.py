@@ -308,6 +308,8 @@ def expand(query: Query, motion: Trajectory) -> Expansion:
 
     -dS/dt = H_xx + A'S + S A - K' 2R K,  K = (2R)^-1 (H_ux + G'S), inputs at a bound left out.
     """
+    from scipy.linalg import expm
+
     if motion.costates is None:
         raise ValueError("motion: needs costates")
     count = max(2, int(np.ceil(motion.duration / _step(query))) + 1)
@@ -322,24 +324,23 @@ def expand(query: Query, motion: Trajectory) -> Expansion:
     lower, upper = query.input_bounds
     free = ((inputs > lower) & (inputs < upper)).astype(float)
     A, G, Hxx, Hux = _second_order(query, states, inputs, costates)
-    weights = 2.0 * query.input_weights
+    inverse = free / (2.0 * query.input_weights)
+    # The Riccati equation as a linear flow of [X, Y], S = Y X^-1, constant over a step (Davison and
+    # Maki 1973): stable however stiff it is, and of second order.
+    push = G * inverse[:, None, :]
+    drift = A - push @ Hux
+    bend = Hxx - Hux.transpose(0, 2, 1) @ (inverse[:, :, None] * Hux)
+    across = push @ G.transpose(0, 2, 1)
+    flow = np.block([[drift, -across], [-bend, -drift.transpose(0, 2, 1)]])
+    steps = expm(-(times[1] - times[0]) * (flow[1:] + flow[:-1]) / 2)
     S = 2.0 * regulator(query).matrix
-    hessians = np.empty((count, *S.shape))
+    n = len(S)
+    hessians = np.empty((count, n, n))
     hessians[-1] = S
-
-    def slope(S: Array, i: int, blend: float) -> Array:
-        a, g, hxx, hux = ((1 - blend) * x[i] + blend * x[i - 1] for x in (A, G, Hxx, Hux))
-        gain = (free[i] / weights)[:, None] * (hux + g.T @ S)
-        half = a.T @ S + hxx / 2 - gain.T @ (weights[:, None] * gain) / 2
-        return half + half.T
-
     for i in range(count - 1, 0, -1):
-        h = times[i] - times[i - 1]
-        k1 = slope(S, i, 0.0)
-        k2 = slope(S + h / 2 * k1, i, 0.5)
-        k3 = slope(S + h / 2 * k2, i, 0.5)
-        k4 = slope(S + h * k3, i, 1.0)
-        S = S + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        both = steps[i - 1] @ np.vstack([np.eye(n), S])
+        S = np.linalg.solve(both[:n].T, both[n:].T).T
+        S = (S + S.T) / 2
         hessians[i - 1] = S
     costs = np.interp(times, motion.times, motion.cost_so_far)
     return Expansion(Trajectory(times, states, inputs, costates, costs), hessians)

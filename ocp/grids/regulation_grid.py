@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ocp.compiled.batch import state_costs
 from ocp.grid import Grid, GridValue
 from ocp.grids.value_iteration import iterate_values
 from ocp.query import Query
@@ -10,6 +11,7 @@ from ocp.trajectory import SolveError, Status
 
 MAX_STATES = 4
 NODES = {1: 400, 2: 20_000, 3: 100_000, 4: 400_000}
+CAP_SECONDS = 100.0  # at the largest cost rate: no optimal motion costs as much
 HELD_CELLS = 2.0  # from the equilibrium, where the linear regulator's value is held
 
 
@@ -41,4 +43,8 @@ def solve_regulation_grid(query: Query, grid: Grid | None = None) -> GridValue:
     cells = np.abs(system.difference(nodes, query.reference)) / grid.spacing
     near = (cells <= HELD_CELLS).all(axis=-1)
     held = np.where(near, RegulatorValue(query).value(nodes), np.inf)
-    return GridValue(grid, iterate_values(query, grid, held=held).checked().values)
+    # From infinite values the scheme can lock: nodes whose motions end among each other wait for
+    # one another for ever. A finite bound lets values fall; where they do not, there is no motion.
+    cap = CAP_SECONDS * float(state_costs(query, nodes.reshape(-1, system.n)).max())
+    values = iterate_values(query, grid, np.full(grid.shape, cap), held=held).checked().values
+    return GridValue(grid, np.where(values < 0.5 * cap, values, np.inf))

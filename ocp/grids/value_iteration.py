@@ -77,7 +77,7 @@ def iterate_values(
     if upper_bound is not None:
         if upper_bound.shape != grid.shape:
             raise ValueError(f"upper_bound: needs shape {grid.shape}, got {upper_bound.shape}")
-        values = np.fmin(values, upper_bound.ravel())
+        values = np.where(fixed, values, np.fmin(values, upper_bound.ravel()))
     if query.hard_obstacles:
         blocked = query.clearance(nodes, hard_only=True) < 0
         values[blocked] = np.inf
