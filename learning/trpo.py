@@ -51,7 +51,7 @@ class TrpoSettings:
         default_factory=lambda: EnvironmentSettings(shaping=2.0)
     )
     seed: int = 0
-    steps: int = 6_000_000
+    steps: int = 983_040
     robots: int = 256
     rollout: int = 64
     hidden: tuple[int, ...] = (128, 128)

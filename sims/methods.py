@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ocp.planning import Answer, OneShot, Planner
 from ocp.query import Equilibrium, Query
 from ocp.query_family import sample_start
-from ocp.trajectory import SolveError
+from ocp.trajectory import SolveError, Status
 from ocp.value import greedy
 
 log = logging.getLogger(__name__)
@@ -146,6 +146,21 @@ def _value_iteration() -> OneShot:
     return OneShot(solve)
 
 
+def _trpo() -> OneShot:
+    from learning.trpo import RolloutValue, TrpoPolicy, TrpoWeights
+
+    weights = TrpoWeights.load()
+
+    def solve(query: Query, _starts: Sequence[NDArray[np.float64]]) -> Answer:
+        try:
+            policy = TrpoPolicy(query, weights)
+        except ValueError as error:
+            raise SolveError(Status.NOT_APPLICABLE, str(error)) from error
+        return policy, RolloutValue(policy, weights.settings.environment)
+
+    return OneShot(solve)
+
+
 METHODS: dict[str, Method] = {
     "adapt": Method("a network that knows the query, exact trajectories, then grids", _adapt),
     "exact": Method("Pontryagin shooting from every state the robot meets", _exact),
@@ -161,6 +176,7 @@ METHODS: dict[str, Method] = {
     ),
     "mpc": Method("receding horizon of 2 s, quadratic cost at its end", _mpc, 0.1),
     "mpc-value": Method("receding horizon of 2 s, the eikonal value at its end", _mpc_value, 0.1),
+    "trpo": Method("a policy trained by TRPO on the paper's family of queries", _trpo, 0.1),
 }
 
 

@@ -114,12 +114,17 @@ def _eikonal(nodes: int) -> Callable[[], Planner]:
     return make
 
 
-def _faithful() -> Any:
-    from learning.faithful_planner import PRETRAINED, FaithfulPlanner
+def _faithful(stem: str) -> Callable[[], Any]:
+    def make() -> Any:
+        from learning.faithful_planner import PRETRAINED, FaithfulPlanner
+        from learning.meta import MetaWeights
 
-    if not PRETRAINED.is_file():
-        raise FileNotFoundError("no trained weights are shipped for the paper's meta learning")
-    return FaithfulPlanner.pretrained()
+        path = PRETRAINED.with_name(f"{stem}.safetensors")
+        if not path.is_file():
+            raise FileNotFoundError("no trained weights are shipped for the paper's meta learning")
+        return FaithfulPlanner(MetaWeights.load(path))
+
+    return make
 
 
 CONTESTANTS = (
@@ -203,10 +208,18 @@ CONTESTANTS = (
         "faithful",
         "Anytime adaptation",
         "",
-        _faithful,
+        _faithful("faithful"),
         EIGHT,
         "Anytime adaptation",
         note="Algorithms 1 and 2 as printed, n = 8",
+    ),
+    Contestant(
+        "repaired",
+        "Anytime adaptation (repaired)",
+        "",
+        _faithful("repaired"),
+        EIGHT,
+        note="Algorithms 1 and 2 with the departures of learning/configs/repaired.toml, n = 8",
     ),
     Contestant(
         "adapt",

@@ -17,19 +17,19 @@ from sims.experiments.sheet import Sheet, number, percent
 GOALS = ((4.0, 4.0), (1.0, 1.0), (1.0, 4.0), (4.0, 1.0))
 """In the order of the figure's panels."""
 PREFERRED = ("adapt", "eikonal")
-PAPERS = "faithful"
+PAPERS = ("faithful", "repaired")
 
 
 def run(setting: Setting, parts: Parts) -> Findings:
     """The paper's own planner, where its weights are there, and ours."""
     ours = next(key for key in PREFERRED if contestant(key).absent is None)
     figures = {}
-    for key in (ours, PAPERS):
+    for key in (ours, *PAPERS):
         if contestant(key).absent is None:
             figures[key] = [_panel(key, goal, parts, setting) for goal in GOALS]
     document = {
         "ours": ours,
-        "absent": {c.key: c.absent for c in CONTESTANTS if c.key == PAPERS and c.absent},
+        "absent": {c.key: c.absent for c in CONTESTANTS if c.key in PAPERS and c.absent},
         "figures": figures,
     }
     return Findings(document, {"fig1": sheet(document)})
@@ -91,6 +91,8 @@ def draw(document: dict[str, Any], out: Path) -> list[Path]:
 
     written = []
     for key, panels in document["figures"].items():
+        if not any(panel["loops"] for panel in panels):
+            continue  # the table says why
         figure, axes = plt.subplots(2, 2, figsize=(8.6, 9.0), layout="constrained")
         for axis, panel, tag in zip(axes.flat, panels, "abcd", strict=True):
             query = paper_query(tuple(panel["goal"]))

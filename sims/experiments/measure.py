@@ -56,7 +56,7 @@ def rehearse(contestant: Contestant, query: Query | None = None) -> None:
     try:
         answer = plan(contestant.planner(), other, [PAPER_START], contestant.until)
         answer.policy(np.array(PAPER_START))
-    except SolveError:  # the query proper will say so again
+    except (SolveError, FloatingPointError):  # the query proper will say so again
         log.debug("rehearsal of %s ended without an answer", contestant.key)
 
 

@@ -114,7 +114,7 @@ def _remark(row: dict[str, Any], claim: float, cost: float | None, optimum: floa
     if row["absent"]:
         return row["absent"]
     if cost is None or optimum is None:
-        return "The closed loop did not reach the goal."
+        return row["failures"][0] if row["failures"] else "The closed loop did not reach the goal."
     gap = (
         f"{percent(cost / optimum - 1)} above the optimum, the paper {percent(claim / optimum - 1)}"
     )

@@ -16,8 +16,8 @@ from sims.methods import METHODS
 QUERIES = Path(__file__).resolve().parents[2] / "sims" / "queries"
 START = ["--start", "-4", "-4", "-0.7853981633974483"]
 
-LARGEST_EXCESS = {"set-valued": 0.06, "interpolation": 0.02, "mpc": 0.21}
-"""From START to (4, 4); MPC's is that of the paper's own MPC. Others: 0.4 %."""
+LARGEST_EXCESS = {"set-valued": 0.06, "interpolation": 0.02, "mpc": 0.21, "trpo": 0.17}
+"""From START to (4, 4); MPC and TRPO: those of the paper. Others: 0.4 %."""
 
 
 def zermelo(capsys, monkeypatch, *arguments: str) -> tuple[int, str, str]:
