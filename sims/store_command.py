@@ -52,7 +52,7 @@ def summary(entry: Entry) -> dict[str, Any]:
     return {
         "key": entry.key,
         "model": entry.order.query["model"],
-        "goal": entry.order.query["goal"]["center"],
+        "goal": entry.query.reference[list(entry.query.system.position)].tolist(),
         "obstacles": len(entry.order.query.get("obstacle", ())),
         "solver": entry.order.solver,
         "settings": dict(entry.order.settings),

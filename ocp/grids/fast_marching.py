@@ -91,8 +91,11 @@ def marched(
     order: int = 2,
     relaxation: float | None = None,
     seed: bool = True,
+    scale: Floats | None = None,
 ) -> Marched:
     """As `march`, with the order in which nodes were accepted.
+
+    `scale` `[*grid.shape]` multiplies 2 sqrt(W) at the nodes; by default 1.
 
     Raises:
         SolveError, ValueError: as `march`.
@@ -106,6 +109,9 @@ def marched(
     else:
         values, first = problem.in_goal(), problem.right_side()
         final, starts = first, np.zeros((0, 2))
+    if scale is not None:
+        factor = problem.stencil.padded(scale**2, 1.0)
+        first, final = first * factor, np.where(final < 0, final, final * factor)
     if not (np.isfinite(values).any() or len(starts)):
         raise ValueError(
             f"grid.shape: {grid.shape} is too coarse for any node to meet the goal of radius "

@@ -1,0 +1,71 @@
+"""Certified brackets: how many contain the exact cost, and how wide they are."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ocp.bracket import lower_bound
+from ocp.eikonal import solve_eikonal
+from ocp.pontryagin import ExactValue
+from ocp.query_family import PAPER_FAMILY, sample_start
+from ocp.trajectory import SolveError
+from sims.benchmarks import Report
+from sims.closed_loop import rollouts
+
+QUERIES, STARTS, EXACT = 100, 100, 10
+"""Queries, starts of each, and of these how many are held against the exact cost."""
+TOLERANCE = 1e-6
+"""Relative: the accuracy of an exact cost."""
+notes = Console(stderr=True)
+
+
+def run(seed: int, _out: Path | None) -> Report:
+    """Upper bounds by rollout of the eikonal policy, lower bounds by subsolution."""
+    rng = np.random.default_rng(seed)
+    gaps, gaps_known, wrong, crossed, checked, lost, seconds = [], [], 0, 0, 0, 0, []
+    with notes.status("brackets") as status:
+        for k in range(QUERIES):
+            status.update(f"query {k + 1} of {QUERIES}")
+            query = PAPER_FAMILY.sample(rng)
+            begun = time.process_time()
+            bound = lower_bound(query)
+            seconds.append(time.process_time() - begun)
+            starts = [sample_start(query, rng) for _ in range(STARTS)]
+            solution = solve_eikonal(query)
+            loops = rollouts(solution.policy(), starts)
+            exact = ExactValue(query, solution.policy())
+            for i, (start, loop) in enumerate(zip(starts, loops, strict=True)):
+                if loop.cost is None:
+                    lost += 1
+                    continue
+                bracket = bound.bracket(start, loop.cost)
+                gaps.append(bracket.gap)
+                crossed += bracket.lower > bracket.upper
+                if i < EXACT:
+                    try:
+                        truth = exact.trajectory(start).cost
+                    except SolveError:
+                        continue
+                    checked += 1
+                    wrong += bracket.lower > truth * (1 + TOLERANCE)
+                    gaps_known.append(truth / bracket.lower - 1)
+    figures = {
+        "brackets": len(gaps),
+        "no rollout reached": lost,
+        "lower above upper": int(crossed),
+        "held against exact costs": checked,
+        "lower above exact": int(wrong),
+        "median gap": float(np.median(gaps)),
+        "gap, 95 %": float(np.quantile(gaps, 0.95)),
+        "median of exact over lower - 1": float(np.median(gaps_known)),
+        "seconds of processor a query": float(np.median(seconds)),
+    }
+    table = Table(title="Certified brackets: random queries of the paper's family")
+    table.add_column("figure")
+    table.add_column("value", justify="right")
+    for name, value in figures.items():
+        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else f"{value:,}")
+    return Report({"brackets": figures}, [table])
