@@ -65,6 +65,8 @@ EVASIONS = (0.4, 1.2, 3.0)
 """Metres: how far away references are tried when braking alone is not enough."""
 RETRY = 0.5
 """Seconds between two attempts at the padding that is preferred, or at a route where none was."""
+SLACK = 0.03
+"""Metres that routes keep beyond the margin at least, for forecasts are judged conservatively."""
 SPROUTS = 40
 """At each such attempt, this part of the tree's nodes is added, until they have doubled."""
 NEWS = 0.3
@@ -397,11 +399,13 @@ class Navigator:
         """Comfort where there is a route that has it, else what is necessary."""
         settings = self.settings
         comfort = settings.robot_radius + settings.comfort
-        least = min(settings.least_padding, comfort)
+        least = min(settings.least_padding + SLACK, comfort)
         blockage = self._update.blockage
         if blockage is not None and blockage.barrier is Barrier.PADDING:
-            if self.planner.padding > least:
-                self._change(time, True, padding=least)
+            # The robot itself may stand a little within the padding.
+            wanted = max(settings.robot_radius, min(least, 0.98 * blockage.largest_padding))
+            if wanted < self.planner.padding - 1e-6:
+                self._change(time, True, padding=wanted)
                 self._retried = time
         elif self.planner.padding < comfort and time - self._retried >= RETRY:
             self._retried = time
@@ -415,7 +419,10 @@ class Navigator:
         if route is None:
             self._brake(time, state, str(self._update.blockage))
             return
-        ahead = along_route(route.points, SHARES * self.settings.farthest)
+        lead = self.settings.farthest
+        # The first corner too: close to obstacles every chord past it may be barred.
+        corner = min(float(np.linalg.norm(route.points[1] - route.points[0])), lead)
+        ahead = along_route(route.points, np.append(SHARES * lead, corner))
         chosen = self._farthest_clear(state, ahead)
         if chosen is None:
             self._brake(time, state, "no way of driving on keeps clear of the obstacles")
