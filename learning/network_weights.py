@@ -71,10 +71,10 @@ class NetworkWeights:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a safetensors file, whole or not at all."""
-        from safetensors.numpy import save_file
+        from safetensors.numpy import save
 
         with atomic_path(path) as temporary:
-            save_file(self.arrays, temporary)
+            temporary.write_bytes(save(self.arrays))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "NetworkWeights":
