@@ -7,6 +7,7 @@ from ocp.lazy import lazy_names
 if TYPE_CHECKING:
     from planners.blockage import Barrier, Blockage
     from planners.robot_world import RobotWorld, three_link_arm
+    from planners.rrt_qx import LegController, Navigator, NavigatorSettings, Rules
     from planners.rrtx import RRTX, Cause, Route, TreeView, Update
     from planners.solids import Solid
     from planners.world import SceneWorld, World
@@ -15,9 +16,13 @@ _HOMES = {
     "Barrier": "blockage",
     "Blockage": "blockage",
     "Cause": "rrtx",
+    "LegController": "rrt_qx",
+    "Navigator": "rrt_qx",
+    "NavigatorSettings": "rrt_qx",
     "RRTX": "rrtx",
     "RobotWorld": "robot_world",
     "Route": "rrtx",
+    "Rules": "rrt_qx",
     "SceneWorld": "world",
     "Solid": "solids",
     "TreeView": "rrtx",
@@ -31,8 +36,12 @@ __all__ = [
     "Barrier",
     "Blockage",
     "Cause",
+    "LegController",
+    "Navigator",
+    "NavigatorSettings",
     "RobotWorld",
     "Route",
+    "Rules",
     "SceneWorld",
     "Solid",
     "TreeView",
