@@ -16,6 +16,10 @@ def ledger(out: Path) -> Sheet:
         path = out / f"{name}.json"
         if path.is_file():
             document = json.loads(path.read_text(encoding="utf-8"))
+            mode = "quick" if document["quick"] else "full"
+            machine = document["machine"]
+            cores = f"{machine['cores']} cores, Python {machine['python']}"
+            sheet.notes.append(f"{name}: {mode} run, seed {document['seed']}, {cores}.")
             for entry in experiment(name).entries(document["findings"]):
                 sheet.add(*cells(entry))
         else:

@@ -193,7 +193,15 @@ CONTESTANTS = (
         NEVER,
         note="20 steps of 0.1 s, the spline of the eikonal value at the end",
     ),
-    Contestant("trpo", "TRPO", "trpo", _registered("trpo"), NEVER, "TRPO"),
+    Contestant(
+        "trpo",
+        "TRPO",
+        "trpo",
+        _registered("trpo"),
+        NEVER,
+        "TRPO",
+        note="one policy for the whole family, about a million steps; the paper trains one a query",
+    ),
     Contestant(
         "interpolation",
         "DNN interpolation",
