@@ -1,11 +1,12 @@
 """`zermelo bench`: run benchmarks and print what they measured."""
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from ocp.files import write_text
+from sims.bench_compare import load, moves, reference_seconds, table
 from sims.benchmarks import BENCHMARKS, machine, run_benchmark
 from sims.exit_status import reading_input
 
@@ -23,13 +24,24 @@ def run(command: "cli.Bench") -> int:
         for name in names:
             if name not in BENCHMARKS:
                 raise ValueError(f"bench: {name!r} is unknown; known are {', '.join(BENCHMARKS)}")
-    document = {"machine": machine(), "seed": command.seed, "benchmarks": {}}
+        before = None if command.compare is None else load(command.compare)
+    document: dict[str, Any] = {
+        "machine": machine(),
+        "reference_s": reference_seconds(),
+        "seed": command.seed,
+        "benchmarks": {},
+    }
     for name in names:
         report = run_benchmark(name, command.seed, command.out)
         document["benchmarks"][name] = report.figures
-        for table in report.tables:
+        for shown in report.tables:
             width = max(Console().width, WIDTH)
-            Console(stderr=command.json, width=width).print(table)
+            Console(stderr=command.json, width=width).print(shown)
+    if before is not None and command.compare is not None:
+        found = moves(before, document)
+        document["moved"] = [vars(move) for move in found]
+        console = Console(stderr=command.json)
+        console.print(table(found, command.compare), width=max(console.width, WIDTH))
     if command.json:
         print(json.dumps(document))
     if command.out is not None:

@@ -143,6 +143,9 @@ class Bench(Common):
         ),
     ] = ()
 
+    compare: Path | None = None
+    """A result (bench.json) to compare with: prints what moved by more than noise."""
+
     def run(self) -> int:
         from sims.bench import run
 
