@@ -23,7 +23,7 @@ from ocp.query import Query
 from ocp.trajectory import SolveError, Status
 from ocp.value import Policy, Value, greedy
 
-REFINEMENT = 100
+REFINEMENT = 50
 """Steps of Adam between two looks at the clock."""
 
 
