@@ -60,7 +60,7 @@ def run(setting: Setting, parts: Parts) -> Findings:
             continue
         curves[name] = parts.get(
             f"fig2-{name}",
-            contestant(key).config,
+            {**contestant(key).config, **SIZES.get(name, {})},
             lambda trace=trace, key=key: _curve(key, trace, query, optima, setting),
         )
     document = {"starts": [list(s) for s in STARTS], "optima": optima, "curves": curves}
@@ -158,6 +158,11 @@ CURVES: dict[str, tuple[str, Callable]] = {
     "interpolation": ("interpolation", _refining("interpolation", 0)),
 }
 """The contestant behind each curve, and what traces it."""
+SIZES = {
+    "eikonal": {"nodes": list(NODES)},
+    "set-valued": {"cells": list(CELLS), "ratio": RATIO},
+}
+"""What the curves of one-shot methods depend on beside that."""
 
 
 def first(points: list[Point], most: float = np.inf) -> float | None:
@@ -221,6 +226,7 @@ def draw(document: dict[str, Any], out: Path) -> list[Path]:
             place = {"xytext": (0, 9), "textcoords": "offset points", "rotation": 35}
             axes.annotate(label, (five, 5), **place, fontsize=8, color="0.3")
     axes.plot([], [], "*", mfc="none", mec="0.3", ms=11, label="time to 5 % in the paper")
+    axes.set_xlim(right=2e3)
     axes.set_ylim(floor / 1.4, 100)
     ticks = (0.001, 0.01, 0.1, 1, 10, 100)
     axes.set_yticks(ticks, ["≤ 0.001", *(f"{t:g}" for t in ticks[1:])])
