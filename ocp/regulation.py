@@ -321,18 +321,19 @@ def expand(query: Query, motion: Trajectory) -> Expansion:
 
     states, costates = sample(motion.states), sample(motion.costates)
     inputs = optimal_inputs(query, states, costates)
-    lower, upper = query.input_bounds
-    free = ((inputs > lower) & (inputs < upper)).astype(float)
     A, G, Hxx, Hux = _second_order(query, states, inputs, costates)
+    middle = [(x[1:] + x[:-1]) / 2 for x in (A, G, Hxx, Hux)]
+    free = _share_within(query, query.reference_input - _pull(query, G, costates))
     inverse = free / (2.0 * query.input_weights)
     # The Riccati equation as a linear flow of [X, Y], S = Y X^-1, constant over a step (Davison and
     # Maki 1973): stable however stiff it is, and of second order.
+    A, G, Hxx, Hux = middle
     push = G * inverse[:, None, :]
     drift = A - push @ Hux
     bend = Hxx - Hux.transpose(0, 2, 1) @ (inverse[:, :, None] * Hux)
     across = push @ G.transpose(0, 2, 1)
     flow = np.block([[drift, -across], [-bend, -drift.transpose(0, 2, 1)]])
-    steps = expm(-(times[1] - times[0]) * (flow[1:] + flow[:-1]) / 2)
+    steps = expm(-(times[1] - times[0]) * flow)
     S = 2.0 * regulator(query).matrix
     n = len(S)
     hessians = np.empty((count, n, n))
@@ -344,6 +345,21 @@ def expand(query: Query, motion: Trajectory) -> Expansion:
         hessians[i - 1] = S
     costs = np.interp(times, motion.times, motion.cost_so_far)
     return Expansion(Trajectory(times, states, inputs, costates, costs), hessians)
+
+
+def _pull(query: Query, G: Array, costates: Array) -> Array:
+    """(2R)^-1 G'p, `[k, m]`: how far the best unbounded input lies below the one at rest."""
+    return np.einsum("knm,kn->km", G, costates) / (2.0 * query.input_weights)
+
+
+def _share_within(query: Query, wanted: Array) -> Array:
+    """`[k - 1, m]`, for what share of each step inputs that go linearly are within the bounds."""
+    lower, upper = query.input_bounds
+    low, high = np.minimum(wanted[1:], wanted[:-1]), np.maximum(wanted[1:], wanted[:-1])
+    width = np.maximum(high - low, 1e-12)
+    within = np.minimum(high, upper) - np.maximum(low, lower)
+    still = ((low >= lower) & (high <= upper)).astype(float)
+    return np.where(high - low < 1e-12, still, np.clip(within / width, 0.0, 1.0))
 
 
 class RegulationValue:

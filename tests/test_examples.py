@@ -1,0 +1,21 @@
+"""The worked examples run, stay short, and do what they say."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+
+
+@pytest.mark.slow
+def test_bring_your_own_robot_swings_it_up_in_drake() -> None:
+    path = EXAMPLES / "bring_your_own_robot.py"
+    assert len(path.read_text().splitlines()) < 40
+    run = subprocess.run([sys.executable, path], capture_output=True, text=True, check=True)
+    numbers = re.findall(r"-?\d+\.\d*", run.stdout.split("after 6 s:")[1])
+    end = np.array([float(x) for x in numbers])
+    np.testing.assert_allclose(np.abs(end), [0.0, np.pi, 0.0, 0.0], atol=0.01)
