@@ -5,7 +5,6 @@ slower or busier machine does not count as a change.
 """
 
 import json
-import statistics
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -32,8 +31,8 @@ class Move:
     ratio: float | None
 
 
-def reference_seconds(repeats: int = 9) -> float:
-    """Median time of a fixed amount of plain Python work: this machine's pace now."""
+def reference_seconds(repeats: int = 30) -> float:
+    """Least time of a fixed amount of plain Python work: the machine's pace, other work aside."""
     times = []
     for _ in range(repeats):
         begun = time.perf_counter()
@@ -41,7 +40,7 @@ def reference_seconds(repeats: int = 9) -> float:
         for k in range(200_000):
             total += k * k
         times.append(time.perf_counter() - begun)
-    return statistics.median(times)
+    return min(times)
 
 
 def load(path: Path) -> dict[str, Any]:

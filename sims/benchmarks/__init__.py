@@ -26,6 +26,7 @@ BENCHMARKS: dict[str, str] = {
     "refmm": "ReFMM: orders, refined against uniform meshes, repair against a new solve",
     "robots": "robots from SDF and URDF: evaluation and transcription, against Drake",
     "rrtx": "RRT^X: repair after changes, against growth from scratch, OMPL and the optimum",
+    "startup": "processor time and memory of zermelo --help and of each package's import",
     "store": "value store: time and bytes an entry, kills survived",
     "learning": "adapt on fresh queries of three families against exact costs, and against time",
 }
