@@ -206,7 +206,7 @@ class MetaPlanner:
     def _steps(self, asked: int, worth_nodes: int) -> tuple[Step, ...]:
         """Small steps first; a coarse grid at least, to tell a wrong class of motions."""
         allowed = GRIDS if self.grids else ()
-        useful = [n for n in allowed if n > worth_nodes or n == allowed[0]]
+        useful = [n for n in allowed if n > worth_nodes or n == GRIDS[0]]
         exact = [Step(start=i) for i in range(asked)]
         more = [Step(start=i) for i in range(asked, TRAJECTORIES)]
         small = [Step(nodes=n) for n in useful if n <= 18_000]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from learning.network_weights import NetworkWeights
-from ocp.query import Query
+from ocp.query import Goal, Query
 from ocp.query_family import PAPER_FAMILY, paper_query
 
 FOLDER = Path(__file__).parent / "pretrained"
@@ -41,6 +41,8 @@ class Pretrained:
         """
         if self.provenance["settings"]["family"] != PAPER_FAMILY.name:
             return True
+        if not isinstance(query.goal, Goal):
+            return False
         x, y = query.goal.center[:2]
         if not (0 <= x <= 5 and 0 <= y <= 5):
             return False

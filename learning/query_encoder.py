@@ -21,7 +21,7 @@ from ocp.compiled.jit import KERNEL_WITH_JACOBIAN, MATRIX, SCALAR, VECTOR, compi
 from ocp.grids import goal_table as table_kernels
 from ocp.grids.goal_table import VALUE_AND_GRADIENT, GoalTable, goal_table, has_goal_table
 from ocp.kernels import Kernels, kernels, parameters
-from ocp.query import Query
+from ocp.query import Goal, Query
 from ocp.query_family import paper_query
 from ocp.trajectory import SolveError, Status
 
@@ -43,6 +43,8 @@ def why_not_encodable(query: Query) -> str | None:
     """
     if query.model != "unicycle":
         return f"the networks are trained for the unicycle, not for {query.system.name}"
+    if not isinstance(query.goal, Goal):
+        return "the networks are trained for goals that are balls"
     if query.is_bounded:
         return "the networks are trained without input bounds"
     if query.hard_obstacles:

@@ -91,7 +91,7 @@ def sample_values(query: Query, sizes: SampleSizes, rng: np.random.Generator) ->
     angles, headings = rng.uniform(-np.pi, np.pi, (2, near_count))
     gaps = np.exp(rng.uniform(np.log(NEAR), np.log(FAR), near_count))
     radius = (query.goal.radius + gaps)[:, None]
-    place = np.array(query.goal.center) + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    place = query.reference[:2] + radius * np.column_stack([np.cos(angles), np.sin(angles)])
     near = np.column_stack([place, headings])
     table = goal_table(query, REACH)
     parts = [
@@ -106,7 +106,7 @@ def sample_values(query: Query, sizes: SampleSizes, rng: np.random.Generator) ->
 def _around_goal(query: Query) -> Grid:
     """A fine grid over a square around the goal and half a turn of headings."""
     whole = Grid.for_query(query, FINE_NODES)
-    center, reach = np.array(query.goal.center), query.goal.radius + AROUND
+    center, reach = query.reference[:2], query.goal.radius + AROUND
     headings = max(9, whole.shape[2])
     side = round((FINE_NODES / headings) ** 0.5)
     return Grid(

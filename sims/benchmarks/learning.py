@@ -20,6 +20,8 @@ from rich.table import Table
 
 from learning.meta_planner import MetaPlanner
 from ocp.eikonal import solve_eikonal
+from ocp.extremals.extremal import find_extremal
+from ocp.extremals.warm_start import rollouts as rough
 from ocp.family_file import load_family, with_obstacle_count
 from ocp.planning import Until, deadline, iterations, trajectories
 from ocp.pontryagin import exact_trajectory
@@ -121,12 +123,17 @@ def problems(family: QueryFamily, seed: int, queries: int, starts: int) -> Any:
         rng = np.random.default_rng([SEED + seed, k])
         query = family.sample(rng)
         known: list[tuple[NDArray[np.float64], Trajectory]] = []
-        for _ in range(starts):
-            start = sample_start(query, rng)
+        drawn = [sample_start(query, rng) for _ in range(starts)]
+        fine = solve_eikonal(query).policy()
+        for start, guess in zip(drawn, rough(query, fine, np.array(drawn)), strict=True):
             try:
-                known.append((start, exact_trajectory(query, start)))
+                best = exact_trajectory(query, start)
             except SolveError as error:
                 notes.print(f"{family.name} {k}: no optimum from {start}: {error}")
+                continue
+            # The search may miss a class of motions that a fine grid finds.
+            other = None if guess is None else find_extremal(query, start, guess).trajectory
+            known.append((start, other if other and other.cost < best.cost else best))
         notes.print(f"{family.name}: query {k + 1} of {queries}", highlight=False)
         yield Problem(query, [s for s, _ in known], [t for _, t in known])
 

@@ -43,12 +43,14 @@ class Leg:
     """One goal's story, times in seconds from the beginning.
 
     Attributes:
-        revealed: when the goal became known.
+        goal: where to.
+        revealed: when it became known.
         reaction: how long its policy took to compute.
         loop: the drive there.
     """
 
     query: Query
+    goal: tuple[float, float]
     revealed: float
     reaction: float
     loop: Rollout
@@ -69,7 +71,7 @@ def run(seed: int, out: Path | None) -> Demonstration:
         rows.append(
             {
                 "revealed_s": leg.revealed,
-                "goal": list(leg.query.goal.center),
+                "goal": list(leg.goal),
                 "reaction_s": leg.reaction,
                 "drive_s": leg.loop.trajectory.duration,
                 "cost": leg.loop.cost,
@@ -79,7 +81,7 @@ def run(seed: int, out: Path | None) -> Demonstration:
         )
         table.add_row(
             f"{leg.revealed:.1f} s",
-            "({:.1f}, {:.1f})".format(*leg.query.goal.center),
+            "({:.1f}, {:.1f})".format(*leg.goal),
             f"{leg.reaction * 1e3:.0f} ms",
             f"{leg.loop.trajectory.duration:.1f} s",
             f"{wait * 1e3:.0f} ms",
@@ -98,13 +100,14 @@ def _drive(rng: np.random.Generator, revealed: NDArray[np.float64]) -> list[Leg]
     legs: list[Leg] = []
     rehearsed = False
     for time in revealed:
-        query = _query(rng, state)
+        goal = _goal(rng, state)
+        query = Query("unicycle", Goal(goal, RADIUS), OBSTACLES)
         if not rehearsed:  # code is loaded before the robot starts
             planner.plan(replace(query, goal=Goal((3.0, -3.5), RADIUS)), [state], deadline(0.5))
             rehearsed = True
         plan = planner.plan(query, [state], deadline(BUDGET))
         loop = rollout(plan.policy, state)
-        legs.append(Leg(query, float(time), plan.reaction_time, loop))
+        legs.append(Leg(query, goal, float(time), plan.reaction_time, loop))
         if not loop.reached:
             break
         state = query.system.wrap(loop.trajectory.states[-1])
@@ -113,13 +116,13 @@ def _drive(rng: np.random.Generator, revealed: NDArray[np.float64]) -> list[Leg]
     return legs
 
 
-def _query(rng: np.random.Generator, state: NDArray[np.float64]) -> Query:
+def _goal(rng: np.random.Generator, state: NDArray[np.float64]) -> tuple[float, float]:
     """A goal clear of the obstacles and of the robot."""
     while True:
         center = rng.uniform(-4.0, 4.0, 2)
         clear = min(float(o.signed_distance(center)) for o in OBSTACLES) > RADIUS
         if clear and np.linalg.norm(center - state[:2]) > 2 * RADIUS:
-            return Query("unicycle", Goal((float(center[0]), float(center[1])), RADIUS), OBSTACLES)
+            return float(center[0]), float(center[1])
 
 
 def _waits(legs: list[Leg], reaction: float | None) -> list[float]:
@@ -142,7 +145,7 @@ def _figure(legs: list[Leg], waits: list[float], paper_waits: list[float], out: 
     figure, (ground, bars) = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained")
     draw_plan(ground, legs[-1].query, [leg.loop for leg in legs], [None] * len(legs))
     for k, leg in enumerate(legs, 1):
-        ground.annotate(str(k), leg.query.goal.center, ha="center", va="center")
+        ground.annotate(str(k), leg.goal, ha="center", va="center")
     ground.set_title("goals in the order of their arrival")
     numbers = np.arange(1, len(legs) + 1)
     bars.bar(numbers - 0.2, np.maximum(waits, 1e-4), 0.4, label="zermelo")

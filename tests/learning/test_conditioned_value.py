@@ -58,7 +58,7 @@ def test_the_compiled_network_equals_torch():
         )
     ]
     owner = torch.arange(len(x)).repeat_interleave(count)
-    V, gradient = value_and_slopes(made, Batch(*tensors, owner), create_graph=False)
+    V, gradient = value_and_slopes(made, Batch(*tensors, owner=owner), create_graph=False)
     values, gradients = compiled(QUERY, made).value_and_gradient(x)
     np.testing.assert_allclose(values, V.detach().numpy(), rtol=1e-5)
     scale = 1e-5 * (1 + np.abs(gradient.detach().numpy()).max(axis=1, keepdims=True))
