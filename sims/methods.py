@@ -146,6 +146,12 @@ def _value_iteration() -> OneShot:
     return OneShot(solve)
 
 
+def _refmm() -> Planner:
+    from ocp.refmm import Refmm
+
+    return Refmm()
+
+
 def _trpo() -> OneShot:
     from learning.trpo import RolloutValue, TrpoPolicy, TrpoWeights
 
@@ -171,6 +177,9 @@ METHODS: dict[str, Method] = {
         "to an equilibrium: value iteration on a grid, up to 4 states", _value_iteration
     ),
     "set-valued": Method("the set-valued method of Xu and Zhu on its coarse grid", _set_valued),
+    "refmm": Method(
+        "repairing fast marching on a mesh refined for the starts, up to 96,000 simplices", _refmm
+    ),
     "interpolation": Method(
         "a network fitted to the set-valued solution of this one query", _interpolation
     ),
