@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 STRIDE = 0.15  # metres or radians: a step of the network's own closed loop
 MOST_STEPS = 400
 MARGIN = 0.5  # metres of the grids beyond the domain
-TRAJECTORIES = 8  # exact ones, from states of its own choice once all asked for are done
+TRAJECTORIES = 8  # exact ones, from states of its own choice if no starts are asked for
 GRIDS = (4_500, 18_000, 60_000, 240_000)
 EARLY = 2  # so many starts are solved exactly before any grid
 CAUTION = 1.3  # by how much a step's expected time is overestimated
@@ -208,14 +208,20 @@ class MetaPlanner:
         allowed = GRIDS if self.grids else ()
         useful = [n for n in allowed if n > worth_nodes or n == GRIDS[0]]
         exact = [Step(start=i) for i in range(asked)]
-        more = [Step(start=i) for i in range(asked, TRAJECTORIES)]
+        more = [Step(start=i) for i in range(TRAJECTORIES)]
         small = [Step(nodes=n) for n in useful if n <= 18_000]
         large = [Step(nodes=n) for n in useful if n > 18_000]
-        first = exact + small if asked <= EARLY else small + exact
-        return (*first, *more, *large)
+        if asked == 0:
+            return (*small, *more, *large)
+        if asked <= EARLY:
+            return (*exact, *small)
+        # Exact trajectories leave a finer grid little to gain at the few starts asked for.
+        return (*small, *exact, *(large if asked > TRAJECTORIES else ()))
 
     def refine(self, state: MetaState) -> MetaState:
         """One exact trajectory or one grid more."""
+        if state.finished:
+            return state
         step, *rest = state.pending
         begun = time.perf_counter()
         state = replace(state, pending=tuple(rest))
