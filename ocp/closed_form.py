@@ -43,7 +43,7 @@ def straight_value(query: Query, state: NDArray[np.float64]) -> float:
     rng = np.random.default_rng(0)
     samples = rng.uniform(system.lower, system.upper, (32, system.n))
     speed = max(np.linalg.norm(motion(x)[1], 2) for x in samples)
-    toward = np.array(query.goal.center) - state[rows]
+    toward = query.goal_position - state[rows]
     distance = float(np.linalg.norm(toward))
     wanted = np.zeros(system.n)
     wanted[rows] = toward / distance

@@ -282,11 +282,10 @@ class Query:
         """Signed distance `[...]` from states `[..., n]` to the goal's region, negative inside."""
         if isinstance(self.goal, Equilibrium):
             offset = self.system.difference(states, self.reference)
+        else:
+            offset = self.position(states) - np.array(self.goal.center)
+        with np.errstate(over="ignore"):  # so far away that the square overflows: infinitely far
             return np.linalg.norm(offset, axis=-1) - self.goal.radius
-        return (
-            np.linalg.norm(self.position(states) - np.array(self.goal.center), axis=-1)
-            - self.goal.radius
-        )
 
     def clearance(self, states: ArrayLike, hard_only: bool = False) -> NDArray[np.float64]:
         """Distance `[...]` from the robot's ball to the nearest obstacle; negative in collision.

@@ -60,3 +60,25 @@ def typical_query(model: str, bounded: bool = False) -> Query:
 
 
 ALL_QUERIES = [(name, bounded) for name in MODELS for bounded in (False, True)]
+"""Every robot, with free and with bounded inputs."""
+
+
+def _meets_a_ball(model: str) -> bool:
+    system = get_model(model)
+    follows = not system.has_drift or system.n == 2 * len(system.position)
+    return isinstance(typical_query(model).goal, Goal) and follows
+
+
+BALL_QUERIES = [(name, bounded) for name, bounded in ALL_QUERIES if _meets_a_ball(name)]
+"""Of these, goals that are balls of positions, for robots without drift or with a velocity for each
+position: a test can then choose ends that move inward."""
+
+
+def tame_states(model: str, rng: np.random.Generator, count: int, size: float) -> np.ndarray:
+    """States `[count, n]` within `size` of 0 and well inside the robot's domain.
+
+    A steering angle near a quarter turn, say, has no finite motion.
+    """
+    system = get_model(model)
+    lower, upper = np.maximum(-size, 0.8 * system.lower), np.minimum(size, 0.8 * system.upper)
+    return rng.uniform(lower, upper, (count, system.n))

@@ -34,7 +34,7 @@ NONSENSE = st.recursive(
     ),
     max_leaves=8,
 )
-MANY = settings(max_examples=300, suppress_health_check=list(HealthCheck))
+MANY = settings(max_examples=300, suppress_health_check=[*HealthCheck])  # pyright: ignore[reportArgumentType]
 
 
 def places(table: Any, path: tuple = ()) -> list[tuple]:
@@ -202,7 +202,7 @@ def test_any_numbers_as_a_grid(lower: list, upper: list, shape: list, value: Any
 # Queries that are valid and hard
 
 
-@settings(max_examples=25, suppress_health_check=list(HealthCheck))
+@settings(max_examples=25, suppress_health_check=[*HealthCheck])  # pyright: ignore[reportArgumentType]
 @given(
     center=st.tuples(st.floats(-5, 5), st.floats(-5, 5)),
     radius=st.floats(0.05, 5.0),

@@ -124,7 +124,7 @@ def _grown(query: Query, start: Array) -> list[Trajectory]:
     system = query.system
     place = list(system.position)
     d, size = float(query.goal_distance(start)), len(system.position)
-    outward = query.position(start) - np.array(query.goal.center)
+    outward = query.position(start) - query.goal_position
     _, _, basis = np.linalg.svd(outward[None])
     across = np.zeros((system.n - 1, system.n))  # all directions but the goal's
     across[: size - 1, place] = basis[1:]

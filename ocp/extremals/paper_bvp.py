@@ -235,7 +235,7 @@ def terminal_cost(query: Query, states: ArrayLike) -> Array:
 
 
 def _exponent(query: Query, states: Array) -> Array:
-    offset = query.position(states) - np.array(query.goal.center)
+    offset = query.position(states) - query.goal_position
     return STEEPNESS * ((offset**2).sum(axis=-1) - query.goal.radius**2)
 
 
@@ -246,7 +246,7 @@ def _terminal_residual(query: Query, last: Array) -> Array:
     ours, theirs = 1.0 / (1.0 + np.exp(min(exponent, 700.0))), 1.0 / (1.0 + np.exp(-exponent))
     slope = np.zeros(n)
     place = list(query.system.position)
-    slope[place] = 2.0 * STEEPNESS * (last[place] - np.array(query.goal.center))
+    slope[place] = 2.0 * STEEPNESS * (last[place] - query.goal_position)
     return np.append(last[n : 2 * n] * ours - slope * theirs, last[2 * n] * ours - theirs)
 
 

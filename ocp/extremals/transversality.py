@@ -53,12 +53,12 @@ class Condition:
 @lru_cache(maxsize=1024)
 def goal_condition(query: Query) -> Condition:
     """On the goal's boundary: at rest where that is good enough, else pushed."""
-    terms = np.array([*query.goal.center, query.goal.radius])
+    terms = np.array([*query.goal_position, query.goal.radius])
     lower, upper = query.input_bounds
     can_rest = not query.system.has_drift and (lower <= 0).all() and (upper >= 0).all()
     if can_rest and query.cost.state is None:
         states = np.zeros((512, query.system.n))
-        states[:, : len(query.goal.center)] = goal_boundary(query, 512)
+        states[:, : len(query.goal_position)] = goal_boundary(query, 512)
         if state_costs(query, states).max() < NEGLIGIBLE:
             return Condition(GOAL_AT_REST, terms)
     return Condition(GOAL_PUSHED, terms)
@@ -72,13 +72,13 @@ def quadratic_condition(reference: ArrayLike, matrix: ArrayLike) -> Condition:
 
 def exponential_condition(query: Query, steepness: float) -> Condition:
     """Anywhere, at the terminal cost exp(a (|p - x_g|^2 - r_g^2)), a = `steepness`."""
-    terms = np.array([*query.goal.center, query.goal.radius, steepness])
+    terms = np.array([*query.goal_position, query.goal.radius, steepness])
     return Condition(EXPONENTIAL, terms)
 
 
 def goal_boundary(query: Query, count: int) -> NDArray[np.float64]:
     """`count` points `[k, d]` spread over the boundary of the goal ball."""
-    d = len(query.goal.center)
+    d = len(query.goal_position)
     k = np.arange(count)
     if d == 1:
         normals = np.where(k % 2 == 0, 1.0, -1.0)[:, None]
@@ -90,7 +90,7 @@ def goal_boundary(query: Query, count: int) -> NDArray[np.float64]:
         around = np.pi * (3.0 - np.sqrt(5.0)) * k
         width = np.sqrt(1.0 - height**2)
         normals = np.column_stack([width * np.cos(around), width * np.sin(around), height])
-    return np.array(query.goal.center) + query.goal.radius * BOUNDARY * normals
+    return query.goal_position + query.goal.radius * BOUNDARY * normals
 
 
 # The type of `terminal_point`

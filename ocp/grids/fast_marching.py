@@ -151,7 +151,7 @@ class _Problem:
         self.stencil: SellingStencil = selling_stencil(query, grid, relaxation)
         d = len(query.system.position)
         self.positions = self._states(np.arange(grid.dimension) < d)
-        corners = np.array([grid.lower[:d], grid.upper[:d]]) - np.array(query.goal.center)
+        corners = np.array([grid.lower[:d], grid.upper[:d]]) - query.goal_position
         self.reach = max(0.0, float(np.hypot.reduce(abs(corners).max(axis=0))) - query.goal.radius)
         self.distance = query.goal_distance(self.positions)
 

@@ -127,7 +127,7 @@ def tabulate(query: Query, drive: Drive, reach: float) -> Floats:
         points = np.empty((len(headings), len(steps), 5))
         lengths = np.zeros(len(headings), dtype=np.int64)
         _trace(
-            kernels(query).flow, parameters(query), np.array(query.goal.center), radius,
+            kernels(query).flow, parameters(query), query.goal_position, radius,
             drive.unit, steps, far, headings, points, lengths,
         )  # fmt: skip
         _smooth(points, lengths, radius, drive.unit)

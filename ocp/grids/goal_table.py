@@ -180,7 +180,7 @@ def goal_table(query: Query, reach: float) -> GoalTable:
     size = _size(reach)
     stack = _stack(query.system, weights, drive, _octave(query), size)
     table = _at_radius(stack, query.goal.radius)
-    return GoalTable(np.array(query.goal.center), query.goal.radius, drive.unit, size, table)
+    return GoalTable(query.goal_position, query.goal.radius, drive.unit, size, table)
 
 
 def _radii(octave: int) -> Floats:

@@ -86,7 +86,7 @@ def _random_problems(report: Report, rng: np.random.Generator) -> None:
             verdict = consult(query, start)
             verdicts.append(verdict)
             if not verdict.established:
-                notes.print(f"{start}, goal {query.goal.center}: {verdict.explanation}")
+                notes.print(f"{start}, goal {query.goal_position}: {verdict.explanation}")
             if guess is None:
                 continue
             begun = time.perf_counter()

@@ -21,7 +21,7 @@ def test_queries_of_the_general_family_keep_its_bounds(table):
     counts = {len(q.obstacles) for q in drawn}
     assert counts == set(range(7))
     for query in drawn:
-        center = np.array(query.goal.center)
+        center = query.goal_position
         assert (abs(center) <= 4.5).all()
         assert 0.3 <= query.goal.radius <= 0.8
         for obstacle in query.obstacles:

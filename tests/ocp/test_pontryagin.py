@@ -35,7 +35,7 @@ angle = st.floats(-np.pi, np.pi)
 def replayed_cost(query: Query, motion: Trajectory) -> tuple[float, np.ndarray]:
     """Cost and end of the open loop, dynamics and running cost written out on their own."""
     spline = CubicSpline(motion.times, motion.inputs)
-    goal, radius = np.array(query.goal.center), query.goal.radius
+    goal, radius = query.goal_position, query.goal.radius
 
     def rate(t: float, y: np.ndarray) -> list[float]:
         v, omega = spline(t)
@@ -95,7 +95,7 @@ def test_both_terminal_conditions() -> None:
     assert_allclose(rest.costates[-1], 0.0, atol=1e-4)
     assert goal_condition(COVERED).kind == GOAL_PUSHED
     assert pushed.costates is not None
-    normal = (pushed.states[-1, :2] - COVERED.goal.center) / COVERED.goal.radius
+    normal = (pushed.states[-1, :2] - COVERED.goal_position) / COVERED.goal.radius
     p = pushed.costates[-1]
     assert p[:2] @ normal > 0.1
     assert p[:2] @ [-normal[1], normal[0]] == pytest.approx(0.0, abs=1e-6)
@@ -304,8 +304,8 @@ def test_the_exact_value_is_exact_feedback() -> None:
         cost += step * float(CIRCLE.running_cost(state, [v, omega]))  # pyright: ignore
         assert cost < 2 * optimum
     assert cost == pytest.approx(optimum, rel=2e-2)
-    assert value.value(np.append(CIRCLE.goal.center, 0.0)) == 0.0
-    assert_allclose(value.gradient(np.append(CIRCLE.goal.center, 0.0)), 0.0)
+    assert value.value(np.append(CIRCLE.goal_position, 0.0)) == 0.0
+    assert_allclose(value.gradient(np.append(CIRCLE.goal_position, 0.0)), 0.0)
 
 
 def test_the_exact_value_takes_many_states_and_whole_turns() -> None:

@@ -1,5 +1,7 @@
 """Legs, and how close a foretold motion comes to obstacles: against longhand and Drake."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -144,7 +146,7 @@ def test_the_first_clear_path_is_the_first_of_those_that_are_clear():
 def test_an_obstacle_is_met_where_it_will_be():
     """A disc and a robot whose ways cross: they meet only if both come at the same time."""
     t = PERIOD * np.arange(80)
-    robot = np.column_stack([-2.0 + t, np.zeros(80)])
+    robot: Any = np.column_stack([-2.0 + t, np.zeros(80)])
     velocity = np.array([[0.0, 1.0]])
     in_time = told([Solid.ball([0.0, -2.0], 0.3)], velocity)
     too_late = told([Solid.ball([0.0, -4.5], 0.3)], velocity)

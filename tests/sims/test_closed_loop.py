@@ -28,7 +28,7 @@ class RadialValue:
         return np.array([aligned_value(d) for d in distance])
 
     def gradient(self, states):
-        offset = self.query.position(states) - np.array(self.query.goal.center)
+        offset = self.query.position(states) - self.query.goal_position
         return offset / np.linalg.norm(offset, axis=-1, keepdims=True)  # only its direction counts
 
 
@@ -52,7 +52,7 @@ def unicycle_rules(query: Query):
             raise AssertionError(f"a greedy policy needs gradients only, not V at {states}")
 
         def gradient(self, states):
-            offset = query.position(states) - np.array(query.goal.center)
+            offset = query.position(states) - query.goal_position
             bearing = np.arctan2(offset[..., 1], offset[..., 0])
             turn = np.sin(2 * (np.asarray(states)[..., 2] - bearing))
             direction = offset / np.linalg.norm(offset, axis=-1, keepdims=True)

@@ -98,6 +98,7 @@ def test_an_obstacle_upon_the_robot_is_a_collision_and_ends_the_run():
     assert not result.reached
     assert result.failure == "collided"
     assert result.duration == pytest.approx(1.0, abs=0.06)
+    assert result.min_clearance is not None
     assert result.min_clearance < 0
 
 
@@ -110,7 +111,7 @@ def test_without_obstacles_there_is_no_clearance():
 def test_the_papers_simulation_is_the_physical_one_with_a_perfect_feedforward():
     """(26) in error coordinates, and with its spring fixed to the origin, drive the same way."""
     tracks = [go("riccati", plant=p)[0].track for p in ("rover", "rover-physical")]
-    np.testing.assert_allclose(*tracks, atol=1e-6)
+    np.testing.assert_allclose(tracks[0], tracks[1], atol=1e-6)
 
 
 def test_the_spring_that_the_paper_drops_pulls_an_uncontrolled_rover_to_the_origin():

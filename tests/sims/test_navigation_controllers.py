@@ -1,5 +1,7 @@
 """The controllers of legs: what they foretell is what happens, and what they learn is the plant."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -56,7 +58,9 @@ def test_what_is_foretold_is_what_happens(name, controller, receding):
     d = loop.robot.plant.dimension
     loop.reference = loop.robot.at_rest(loop.robot.start + 3.0)
     loop.driver.new_leg()
-    told = loop.driver.forecast((loop.state - loop.reference)[None], receding)[0]
+    forecast = loop.driver.forecast((loop.state - loop.reference)[None], receding)
+    assert forecast is not None
+    told = forecast[0]
     happened = [loop.state[:d]]
     for _ in range(len(told) - 1):
         if receding:
@@ -71,14 +75,15 @@ def test_what_is_foretold_is_what_happens(name, controller, receding):
 
 @pytest.mark.parametrize("name", list(PLANTS))
 def test_learning_ends_with_the_optimal_gain_and_never_sees_the_plant(name):
-    exact = make_controller(
+    exact: Any = make_controller(
         "riccati", robot(name).plant, robot(name).cost, PERIOD, np.zeros(1), np.random.default_rng()
     )
     loop = Loop(name, "q-learning", seed=3)
     assert not loop.driver.ready
     assert loop.driver.forecast(np.zeros((1, loop.robot.plant.n)), True) is None
     loop.until_ready()
-    error = np.linalg.norm(loop.driver.gains - exact.gains) / np.linalg.norm(exact.gains)
+    learned: Any = loop.driver
+    error = np.linalg.norm(learned.gains - exact.gains) / np.linalg.norm(exact.gains)
     assert error < 1e-5
     for value in vars(loop.driver).values():
         assert value is not loop.robot.plant
@@ -96,9 +101,10 @@ def test_a_robot_with_a_spring_learns_what_holds_it_anywhere():
 def test_the_stopping_time_of_a_double_integrator_is_near_that_of_its_best_brake():
     """By search over references on a fine grid, with an integration of its own."""
     rover = robot("double-integrator")
-    k_p, k_v = make_controller(
+    exact: Any = make_controller(
         "riccati", rover.plant, rover.cost, PERIOD, np.zeros(4), np.random.default_rng()
-    ).gains[0][0, [0, 2]]
+    )
+    k_p, k_v = exact.gains[0][0, [0, 2]]
     farthest = []
     for reference in np.linspace(-1.0, 1.0, 201):
         p, v, most = 0.0, 1.0, 0.0

@@ -4,6 +4,7 @@ import copy
 import math
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ GOOD = {
 def changed(path, value):
     """GOOD with one entry replaced (or taken out, if the value is None)."""
     table = copy.deepcopy(GOOD)
-    place = table
+    place: Any = table
     for key in path[:-1]:
         place = place[key] if isinstance(key, int) else place.setdefault(key, {})
     if value is None:

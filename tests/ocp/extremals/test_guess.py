@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from references import ALL_QUERIES, typical_query
+from references import BALL_QUERIES, typical_query
 
 from ocp.extremals.guess import default_guesses
 from ocp.obstacle import Obstacle
@@ -12,7 +12,7 @@ from ocp.query_family import paper_query
 START = np.array([-4.0, -4.0, -np.pi / 4])
 
 
-@pytest.mark.parametrize(("model", "bounded"), ALL_QUERIES)
+@pytest.mark.parametrize(("model", "bounded"), BALL_QUERIES)
 def test_guesses_lead_from_start_to_goal_within_the_bounds(model, bounded):
     query = typical_query(model, bounded)
     start = np.full(query.system.n, -2.5)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from references import ALL_QUERIES, typical_query
+from references import BALL_QUERIES, typical_query
 
 from ocp.extremals.hamiltonian_flow import flow_layout
 from ocp.extremals.shooting import shooting_addresses
@@ -41,20 +41,20 @@ def ends(query: Query, count: int = 12) -> np.ndarray:
     place = list(query.system.position)
     states[:, place] = goal_boundary(query, count)
     if query.system.has_drift:
-        normals = states[:, place] - np.array(query.goal.center)
+        normals = states[:, place] - query.goal_position
         states[:, len(place) :] = -2 * normals
     return states
 
 
-@pytest.mark.parametrize(("model", "bounded"), ALL_QUERIES)
+@pytest.mark.parametrize(("model", "bounded"), BALL_QUERIES)
 def test_pushed_ends_lie_on_the_boundary_with_h_zero_moving_inward(model, bounded) -> None:
     query = typical_query(model, bounded)
-    d, n, k, q = len(query.goal.center), query.system.n, kernels(query), parameters(query)
+    d, n, k, q = len(query.goal_position), query.system.n, kernels(query), parameters(query)
     condition = goal_condition(query)
     rate = np.empty(2 * n)
     for end in ends(query):
         z, _ = at(query, condition, end)
-        normal = (z[:d] - np.array(query.goal.center)) / query.goal.radius
+        normal = (z[:d] - query.goal_position) / query.goal.radius
         assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-9)
         assert_allclose(z[d:n], end[d:])
         push = float(z[n : n + d] @ normal)
@@ -84,7 +84,7 @@ def test_the_push_of_the_unicycle_in_closed_form() -> None:
         assert z[3:5] @ normal == pytest.approx(2 * np.sqrt(phi) / facing, rel=1e-6)
 
 
-@pytest.mark.parametrize(("model", "bounded"), ALL_QUERIES)
+@pytest.mark.parametrize(("model", "bounded"), BALL_QUERIES)
 @pytest.mark.parametrize("kind", ["goal", "quadratic", "exponential"])
 def test_tangents_by_finite_differences(model: str, bounded: bool, kind: str) -> None:
     query = typical_query(model, bounded)

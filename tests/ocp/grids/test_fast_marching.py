@@ -275,8 +275,9 @@ GENERAL = Query(
 )
 TIME_FREE = [
     name
-    for name in MODELS
-    if (q := Query(name, Goal((0.5,) * len(MODELS[name]().position), 0.6))).is_time_free
+    for name, system in ((name, make()) for name, make in MODELS.items())
+    if not system.has_drift
+    and (q := Query(name, Goal((0.5,) * len(system.position), 0.6))).is_time_free
 ]
 
 

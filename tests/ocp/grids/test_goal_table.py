@@ -47,7 +47,7 @@ def optimal_points(query: Query, final_headings, durations) -> tuple[np.ndarray,
     """
     flow, q = kernels(query).flow, parameters(query)
     cost = kernels(query).state_cost
-    x, y = query.goal.center
+    x, y = query.goal_position
 
     def rate(_, y):
         out = np.empty(6)
@@ -143,7 +143,7 @@ positions = st.tuples(st.floats(-5, 5), st.floats(-5, 5))
 def test_it_has_the_robot_s_symmetries(position, heading, angle):
     """Rotation about the goal, reflection on a ray, half a turn."""
     table = goal_table(PAPER, 14.0)
-    center = np.array(PAPER.goal.center)
+    center = PAPER.goal_position
     offset = np.array(position) - center
     c, s = math.cos(angle), math.sin(angle)
     turned = center + np.array([[c, -s], [s, c]]) @ offset
