@@ -57,6 +57,8 @@ class Plan(Common):
     """Exact trajectories to use at most, for the methods that learn from them."""
     no_exact: bool = False
     """Leave out the exact optimum."""
+    cluster: str | None = None
+    """Address of a Dask scheduler, whose workers find the exact optima."""
 
     def run(self) -> int:
         from sims.plan import run

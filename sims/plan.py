@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from ocp.execution import completed, open_door
 from ocp.files import atomic_path, write_text
 from ocp.planning import Plan, deadline, plan, trajectories
 from ocp.pontryagin import ExactValue
 from ocp.query import Query
-from ocp.query_file import query_to_dict
+from ocp.query_file import query_from_dict, query_to_dict
 from ocp.trajectory import SolveError, Trajectory
 from sims.closed_loop import LoopSettings, Rollout, rollouts
 from sims.exit_status import UNSOLVED, reading_input
@@ -75,8 +76,11 @@ def solve(
     seconds: float | None = None,
     count: int | None = None,
     with_exact: bool = True,
+    cluster: str | None = None,
 ) -> tuple[Plan, list[Outcome]]:
     """Plan, close the loop from every start, and find the exact optimum beside each.
+
+    With the address of a Dask `cluster` the optima are found there, all starts at once.
 
     Raises:
         SolveError: if the method found no policy.
@@ -88,21 +92,46 @@ def solve(
         until = until | deadline(seconds)
     answer = plan(chosen.planner_for(seconds), query, starts, until)
     loops = rollouts(answer.policy, starts, LoopSettings(period=chosen.period))
-    outcomes = []
-    with notes.status("exact optimum") as status:
-        for k, (start, loop) in enumerate(zip(starts, loops, strict=True), 1):
-            status.update(f"exact optimum {k} of {len(starts)}")
-            value = float(np.asarray(answer.value.value(start)))
-            exact, why_not = None, None
-            if with_exact and np.isfinite(value):
-                exact, why_not = _exact(query, start)
-            elif with_exact:
-                why_not = f"{method} found no admissible motion, so none was looked for"
-            outcomes.append(Outcome(value, loop, exact, why_not))
+    values = [float(np.asarray(answer.value.value(start))) for start in starts]
+    wanted = [k for k, value in enumerate(values) if with_exact and np.isfinite(value)]
+    optima = dict(zip(wanted, _optima(query, [starts[k] for k in wanted], cluster), strict=True))
+    none = f"{method} found no admissible motion, so none was looked for" if with_exact else None
+    outcomes = [
+        Outcome(value, loop, *optima.get(k, (None, none)))
+        for k, (value, loop) in enumerate(zip(values, loops, strict=True))
+    ]
     return answer, outcomes
 
 
-def _exact(query: Query, start: NDArray) -> tuple[Trajectory | None, str | None]:
+Optimum = tuple[Trajectory | None, str | None]
+
+
+def _optima(query: Query, starts: list[NDArray], cluster: str | None) -> list[Optimum]:
+    """The optimal motion from each start, or why there is none."""
+    with notes.status("exact optimum") as status:
+        if cluster is None:
+            found = []
+            for k, start in enumerate(starts, 1):
+                status.update(f"exact optimum {k} of {len(starts)}")
+                found.append(_exact(query, start))
+            return found
+        table = query_to_dict(query)
+        optima: list[Optimum] = [(None, "the cluster gave no answer")] * len(starts)
+        with open_door(cluster=cluster) as door:
+            tasks = [(table, start.tolist()) for start in starts]
+            for outcome in completed(door, exact_from, tasks):
+                failed = outcome.failure
+                optima[outcome.index] = (None, failed.message) if failed else outcome.answer
+        return optima
+
+
+def exact_from(task: tuple[dict[str, Any], list[float]]) -> Optimum:
+    """A worker's share: the optimum of a query (as a table) from a start `[n]`."""
+    table, start = task
+    return _exact(query_from_dict(table), np.array(start))
+
+
+def _exact(query: Query, start: NDArray) -> Optimum:
     """The optimal motion if it counts as truth, else why it does not."""
     from ocp.oracle import consult
 
@@ -139,6 +168,7 @@ def run(command: "cli.Plan") -> int:
             seconds=command.deadline,
             count=command.trajectories,
             with_exact=not command.no_exact,
+            cluster=command.cluster,
         )
     except SolveError as error:
         notes.print(f"zermelo: {method}: {error}")
