@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-import skfmm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
@@ -250,6 +249,7 @@ def test_isotropic_values_converge_to_the_closed_form() -> None:
 
 def test_isotropic_values_approach_those_of_scikit_fmm() -> None:
     """Another fast marching on the same nodes, W far from constant: differences fall with h."""
+    skfmm = pytest.importorskip("skfmm")
     soft = (Obstacle.circle((-1.0, -1.0), 1.0),)
     query = replace(ISOTROPIC[2], obstacles=soft)
     errors = []
