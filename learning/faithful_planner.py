@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from learning.adaptation import Adaptation, adapt_once
 from learning.meta import MetaWeights
 from learning.meta_data import goal_ball
-from learning.network_value import GradientPolicy, NetworkValue
+from learning.network_value import StateNetworkValue
 from ocp.query import Query
-from ocp.value import Policy, Value
+from ocp.value import GradientPolicy, Policy, Value
 
 PRETRAINED = Path(__file__).parent / "pretrained" / "faithful.safetensors"
 """theta_meta of configs/section-iv-b.toml."""
@@ -100,4 +100,6 @@ class FaithfulPlanner:
 
     def value(self, state: FaithfulState) -> Value:
         adaptation = state.adaptation
-        return NetworkValue(adaptation.query, self.weights.config.network, adaptation.parameters)
+        return StateNetworkValue(
+            adaptation.query, self.weights.config.network, adaptation.parameters
+        )

@@ -17,7 +17,7 @@ from learning.config import DataSettings, LossSettings, NetworkSettings
 from learning.faithful_data import supervision
 from learning.losses import Derivative, Lagrangian, Reduction, lagrangian_gradient
 from learning.meta_data import FeatureMap, QueryTable, SampleMap, Supervision, goal_ball
-from learning.network_value import NetworkValue
+from learning.network_value import StateNetworkValue
 from learning.value_network import Architecture, Parameters, expanded
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status
@@ -88,8 +88,8 @@ class Fit:
         return len(self.losses) >= self.settings.steps
 
     @property
-    def value(self) -> NetworkValue:
-        return NetworkValue(self.query, self.settings.network, self.parameters)
+    def value(self) -> StateNetworkValue:
+        return StateNetworkValue(self.query, self.settings.network, self.parameters)
 
 
 def begun(query: Query, data: Supervision, settings: InterpolationSettings) -> Fit:

@@ -1,4 +1,4 @@
-"""A trained V^NN as a value of the project, and the paper's feedback on it."""
+"""A trained V^NN, a network of the state alone, as a value of the project."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,15 +11,13 @@ from learning.config import NetworkSettings
 from learning.losses import Structure
 from learning.meta_data import DistanceBound, FeatureMap
 from learning.value_network import ForwardPass, Parameters
-from ocp.compiled.batch import optimal_inputs
 from ocp.query import Query
-from ocp.value import Value
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkValue:
+class StateNetworkValue:
     """V^NN(x; theta) for a query: 0 in the goal, never below 0.
 
     Attributes:
@@ -81,19 +79,3 @@ class NetworkValue:
     @cached_property
     def _bound(self) -> DistanceBound:
         return DistanceBound(self.query)
-
-
-@dataclass(frozen=True)
-class GradientPolicy:
-    """u = h(grad V), the paper's feedback: the gradient's size counts as well as its direction.
-
-    `ocp.value.greedy` uses the direction alone, which no error of size can stall.
-    """
-
-    query: Query
-    value: Value
-
-    def __call__(self, states: ArrayLike) -> Array:
-        """Inputs `[..., m]` at states `[..., n]`."""
-        states = np.asarray(states, dtype=float)
-        return optimal_inputs(self.query, states, self.value.gradient(states))

@@ -46,13 +46,26 @@ class GreedyPolicy:
 
     def __call__(self, states: ArrayLike) -> NDArray[np.float64]:
         states = np.asarray(states, dtype=float)
-        inputs = optimal_inputs(self.query, states, self.value.gradient(states))
+        inputs = GradientPolicy(self.query, self.value)(states)
         if not self.query.is_time_free:
             return inputs
         effort = (self.query.input_weights * inputs**2).sum(axis=-1)
         wanted = state_costs(self.query, states)
         scale = np.sqrt(wanted / np.where(effort > 0, effort, np.inf))
         return inputs * scale[..., None]
+
+
+@dataclass(frozen=True)
+class GradientPolicy:
+    """u(x) = argmin_u H(x, u, grad V(x)) as it stands: the gradient's size counts, not only where
+    it points. An error of size can stall such a policy; `GreedyPolicy` is what to use."""
+
+    query: Query
+    value: Value
+
+    def __call__(self, states: ArrayLike) -> NDArray[np.float64]:
+        states = np.asarray(states, dtype=float)
+        return optimal_inputs(self.query, states, self.value.gradient(states))
 
 
 def greedy(query: Query, value: Value) -> GreedyPolicy:

@@ -24,14 +24,14 @@ from learning.adaptation import Adaptation, adapt_once, next_trajectory
 from learning.config import Config, Optimizer, Source
 from learning.losses import Derivative, Reduction, Structure
 from learning.meta import MetaWeights, train
-from learning.network_value import GradientPolicy, NetworkValue
+from learning.network_value import StateNetworkValue
 from learning.value_network import Activation
 from ocp.pontryagin import exact_trajectory
 from ocp.query import Query
 from ocp.query_family import PAPER_FAMILY, sample_start
 from ocp.set_valued import COARSE
 from ocp.trajectory import SolveError, Trajectory
-from ocp.value import greedy
+from ocp.value import GradientPolicy, greedy
 from sims.closed_loop import LoopSettings, rollouts
 
 log = logging.getLogger(__name__)
@@ -146,7 +146,7 @@ def evaluate(
                 lost = np.full(len(trial.starts), np.nan)
                 results[n].append((lost, lost, lost))
                 continue
-            value = NetworkValue(query, weights.config.network, adaptation.parameters)
+            value = StateNetworkValue(query, weights.config.network, adaptation.parameters)
             paper = _costs(GradientPolicy(query, value), trial.starts)
             direction = _costs(greedy(query, value), trial.starts)
             results[n].append((value.value(trial.starts), paper, direction))

@@ -14,7 +14,7 @@ from learning.faithful_planner import FaithfulPlanner
 from learning.losses import Derivative, Reduction, Structure, lagrangian_gradient
 from learning.meta import MetaWeights, architecture
 from learning.meta_data import along_trajectory, in_goal
-from learning.network_value import NetworkValue
+from learning.network_value import StateNetworkValue
 from learning.value_network import Activation
 from ocp.compiled.batch import running_costs
 from ocp.models.linear import single_integrator
@@ -155,7 +155,7 @@ def test_adaptation_converges_to_a_value_known_in_closed_form() -> None:
     states, exact = aligned_states((4.0, 4.0), held_out), aligned_values(held_out)
 
     def error() -> float:
-        value = NetworkValue(QUERY, network, state.parameters)
+        value = StateNetworkValue(QUERY, network, state.parameters)
         return float(np.abs(value.value(states) - exact).max())
 
     errors = [error()]
@@ -198,7 +198,7 @@ def test_the_value_is_zero_in_the_goal_and_nowhere_negative() -> None:
     for structure in Structure:
         network = NetworkSettings((16, 16), Activation.RELU, structure=structure)
         config = replace(CONFIG, network=network)
-        value = NetworkValue(QUERY, network, untrained(config).parameters)
+        value = StateNetworkValue(QUERY, network, untrained(config).parameters)
         rng = np.random.default_rng(0)
         states = rng.uniform(QUERY.system.lower, QUERY.system.upper, (200, 3))
         assert (value.value(states) >= 0).all()
@@ -213,7 +213,7 @@ def test_the_gradient_is_the_values_derivative(structure: Structure, relative: b
     network = NetworkSettings((16, 16), Activation.SILU, relative, structure)
     theta = untrained(replace(CONFIG, network=network)).parameters
     theta = (*(p.double() for p in theta[:-1]), theta[-1].double() + 5.0)  # V > 0 everywhere
-    value = NetworkValue(QUERY, network, theta)
+    value = StateNetworkValue(QUERY, network, theta)
     rng = np.random.default_rng(0)
     states = rng.uniform(QUERY.system.lower, QUERY.system.upper, (50, 3))
     states = states[QUERY.goal_distance(states) > 0.1]

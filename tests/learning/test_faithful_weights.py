@@ -10,7 +10,7 @@ import pytest
 from learning.config import Config
 from learning.faithful_planner import PRETRAINED, REPAIRED, FaithfulPlanner
 from learning.meta import MetaWeights
-from learning.network_value import NetworkValue
+from learning.network_value import StateNetworkValue
 from ocp.eikonal import solve_eikonal
 from ocp.query_family import PAPER_FAMILY, sample_start
 
@@ -40,7 +40,7 @@ def test_the_repaired_meta_value_is_near_the_value_of_fresh_queries() -> None:
         query = PAPER_FAMILY.sample(rng)
         states = np.array([sample_start(query, rng) for _ in range(30)])
         exact = solve_eikonal(query).value.value(states)
-        value = NetworkValue(query, weights.config.network, weights.parameters).value(states)
+        value = StateNetworkValue(query, weights.config.network, weights.parameters).value(states)
         errors.append(np.abs(value - exact))
         sizes.append(exact)
     assert np.mean(errors) < 0.07 * np.mean(sizes)

@@ -23,13 +23,14 @@ from learning.losses import (
     lagrangian_gradient,
 )
 from learning.meta_data import DistanceBound, FeatureMap, SampleMap, Supervision
-from learning.network_value import GradientPolicy, NetworkValue
+from learning.network_value import StateNetworkValue
 from learning.value_network import Activation
 from ocp.compiled.batch import rates, running_costs
 from ocp.eikonal import solve_eikonal
 from ocp.query import Query
 from ocp.query_family import paper_query
 from ocp.trajectory import SolveError
+from ocp.value import GradientPolicy
 
 forms = pytest.mark.parametrize("form", FORMS, ids=form_name)
 
@@ -95,7 +96,7 @@ def test_the_control_is_the_hamiltonians_minimiser(structure: Structure, relativ
     data = unicycle_supervision(query)
     settings = NetworkSettings((7, 6, 5), Activation.SILU, relative, structure)
     theta = small_networks(Activation.SILU)
-    value = NetworkValue(query, settings, theta)
+    value = StateNetworkValue(query, settings, theta)
     outside = query.goal_distance(data.states) > 0
     data = Supervision(data.states[outside], data.values[outside], data.inputs[outside])
     expected = ((GradientPolicy(query, value)(data.states) - data.inputs) ** 2).sum()
