@@ -16,7 +16,7 @@ test: .venv/installed
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 notebooks: .venv/installed
-	$(BIN)/python -m pytest --numprocesses 2 -m notebook tests/test_notebooks.py
+	$(BIN)/python -m pytest --numprocesses 2 -m notebook
 
 docs: .venv/installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict

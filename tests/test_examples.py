@@ -11,7 +11,7 @@ import pytest
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 
-@pytest.mark.slow
+@pytest.mark.notebook
 def test_bring_your_own_robot_swings_it_up_in_drake() -> None:
     path = EXAMPLES / "bring_your_own_robot.py"
     assert len(path.read_text().splitlines()) < 40

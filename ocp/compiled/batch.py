@@ -4,25 +4,31 @@ import numpy as np
 from numba import types
 from numpy.typing import ArrayLike, NDArray
 
+from ocp.compiled.function_address import ADDRESSES, address, function_at
 from ocp.compiled.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled
 from ocp.kernels import kernels, parameters
 from ocp.query import Query
 
+kernel_at, scalar_at = function_at(KERNEL), function_at(SCALAR)
 
-@compiled(types.void(KERNEL, MATRIX, VECTOR, MATRIX))
-def _rows(kernel, inputs, parameter, out):
+
+@compiled(types.void(ADDRESSES, MATRIX, VECTOR, MATRIX))
+def _rows(where, inputs, parameter, out):
+    kernel = kernel_at(where[0, 0], where[0, 1])
     for i in range(inputs.shape[0]):
         kernel(inputs[i], parameter, out[i])
 
 
-@compiled(types.void(KERNEL, MATRIX, MATRIX, MATRIX))
-def _paired_rows(kernel, first, second, out):
+@compiled(types.void(ADDRESSES, MATRIX, MATRIX, MATRIX))
+def _paired_rows(where, first, second, out):
+    kernel = kernel_at(where[0, 0], where[0, 1])
     for i in range(first.shape[0]):
         kernel(first[i], second[i], out[i])
 
 
-@compiled(types.void(SCALAR, MATRIX, VECTOR, VECTOR))
-def _scalars(kernel, inputs, parameter, out):
+@compiled(types.void(ADDRESSES, MATRIX, VECTOR, VECTOR))
+def _scalars(where, inputs, parameter, out):
+    kernel = scalar_at(where[0, 0], where[0, 1])
     for i in range(inputs.shape[0]):
         out[i] = kernel(inputs[i], parameter)
 
@@ -31,7 +37,7 @@ def state_costs(query: Query, states: ArrayLike) -> NDArray[np.float64]:
     """W(x) `[...]` at states `[..., n]`."""
     rows, shape = _flat(states, query.system.n)
     out = np.empty(len(rows))
-    _scalars(kernels(query).state_cost, rows, parameters(query), out)
+    _scalars(address(kernels(query).state_cost), rows, parameters(query), out)
     return out.reshape(shape)
 
 
@@ -39,7 +45,7 @@ def running_costs(query: Query, states: ArrayLike, inputs: ArrayLike) -> NDArray
     """L(x, u) `[...]` at states `[..., n]` and inputs `[..., m]`."""
     rows, shape = _flat(_joined(states, inputs), query.system.n + query.system.m)
     out = np.empty(len(rows))
-    _scalars(kernels(query).running_cost, rows, parameters(query), out)
+    _scalars(address(kernels(query).running_cost), rows, parameters(query), out)
     return out.reshape(shape)
 
 
@@ -47,7 +53,8 @@ def rates(query: Query, states: ArrayLike, inputs: ArrayLike) -> NDArray[np.floa
     """x' `[..., n]` at states `[..., n]` and inputs `[..., m]`."""
     rows, shape = _flat(states, query.system.n)
     out = np.empty_like(rows)
-    _paired_rows(kernels(query).dynamics, rows, _flat(inputs, query.system.m)[0], out)
+    where = address(kernels(query).dynamics)
+    _paired_rows(where, rows, _flat(inputs, query.system.m)[0], out)
     return out.reshape(*shape, query.system.n)
 
 
@@ -56,7 +63,7 @@ def optimal_inputs(query: Query, states: ArrayLike, costates: ArrayLike) -> NDAr
     n, m = query.system.n, query.system.m
     rows, shape = _flat(_joined(states, costates), 2 * n)
     out = np.empty((len(rows), m))
-    _rows(kernels(query).optimal_input, rows, parameters(query), out)
+    _rows(address(kernels(query).optimal_input), rows, parameters(query), out)
     return out.reshape(*shape, m)
 
 
@@ -66,7 +73,7 @@ def minimised_hamiltonians(
     """min_u H `[...]` at states and costates `[..., n]`; 0 where the costate is V's gradient."""
     rows, shape = _flat(_joined(states, costates), 2 * query.system.n)
     out = np.empty(len(rows))
-    _scalars(kernels(query).minimised_hamiltonian, rows, parameters(query), out)
+    _scalars(address(kernels(query).minimised_hamiltonian), rows, parameters(query), out)
     return out.reshape(shape)
 
 

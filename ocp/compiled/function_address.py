@@ -6,6 +6,7 @@ microseconds a call, in looking its address up anew. A caller that is called oft
 """
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,12 @@ def addresses(functions: Sequence[Any]) -> NDArray[np.intp]:
             ]
         )
     return np.array(rows, dtype=np.intp)
+
+
+@cache
+def address(function: Any) -> NDArray[np.intp]:
+    """`addresses` of one function, looked up once; the function is kept alive with it."""
+    return addresses([function])
 
 
 def function_at(function_type: types.FunctionType) -> Any:

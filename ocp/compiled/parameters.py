@@ -1,6 +1,7 @@
 """The numbers of a query as one vector, the argument q of every compiled kernel."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,12 @@ class Layout:
 
 def parameters(query: Query) -> NDArray[np.float64]:
     """The parameter vector q of a query: input limits and weights, goal, cost, obstacles."""
+    # A copy: compiled signatures take writable arrays, and nobody may write into the kept one.
+    return _parameters(query).copy()
+
+
+@lru_cache(maxsize=256)
+def _parameters(query: Query) -> NDArray[np.float64]:
     layout = Layout.of(query)
     w = query.cost
     head = [

@@ -13,7 +13,7 @@ from numba import types
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.compiled.batch import running_costs, state_costs
-from ocp.compiled.function_address import ADDRESSES, addresses, function_at
+from ocp.compiled.function_address import ADDRESSES, address, addresses, function_at
 from ocp.compiled.jit import KERNEL, KERNEL_WITH_JACOBIAN, MATRIX, VECTOR, compiled
 from ocp.kernels import Kernels, kernels, parameters
 from ocp.query import Query
@@ -28,6 +28,7 @@ PERIOD = 0.05  # seconds: a rollout's step otherwise
 MAX_STEPS = 800
 
 kernel_at = function_at(KERNEL)
+derivatives_at = function_at(KERNEL_WITH_JACOBIAN)
 
 
 def with_costates(query: Query, guess: Trajectory) -> Trajectory:
@@ -38,7 +39,9 @@ def with_costates(query: Query, guess: Trajectory) -> Trajectory:
     # Inputs of a guess may jump: the later node's belong to the interval (see `guess.py`).
     jacobians = _state_jacobians(query.system, middles, guess.inputs[1:])
     slopes = np.empty_like(middles)
-    _cost_gradients(kernels(query).state_cost_derivatives, middles, parameters(query), slopes)
+    _cost_gradients(
+        address(kernels(query).state_cost_derivatives), middles, parameters(query), slopes
+    )
     # The implicit midpoint rule, which stays bounded on long intervals.
     lengths = np.diff(guess.times)[:, None]
     pull = lengths[..., None] / 2 * jacobians.transpose(0, 2, 1)
@@ -204,8 +207,9 @@ def _state_jacobians(system: System, states: Array, inputs: Array) -> Array:
     return stacked.reshape(system.n, len(states), system.n).transpose(1, 2, 0)
 
 
-@compiled(types.void(KERNEL_WITH_JACOBIAN, MATRIX, VECTOR, MATRIX))
-def _cost_gradients(derivatives, states, q, out):
+@compiled(types.void(ADDRESSES, MATRIX, VECTOR, MATRIX))
+def _cost_gradients(where, states, q, out):
+    derivatives = derivatives_at(where[0, 0], where[0, 1])
     n = states.shape[1]
     hessian = np.empty((n, n))
     for i in range(states.shape[0]):
