@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from learning.compiled_network import NetworkPolicy, NetworkValue
-from learning.pretrained_weights import Pretrained, load_pretrained
-from learning.query_encoder import QueryEncoder
-from learning.tube import TubePolicy, Tubes, TubeValue
+from learning.conditioned.compiled_network import NetworkPolicy, NetworkValue
+from learning.conditioned.pretrained_weights import Pretrained, load_pretrained
+from learning.conditioned.query_encoder import QueryEncoder
+from learning.conditioned.tube import TubePolicy, Tubes, TubeValue
 from ocp.eikonal import solve_eikonal
 from ocp.extremals.extremal import Extremal, find_extremal
 from ocp.extremals.warm_start import rollouts, timed

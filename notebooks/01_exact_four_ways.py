@@ -24,7 +24,7 @@ from ocp.collocation import solve_collocation
 from ocp.eikonal import solve_eikonal
 from ocp.query_family import PAPER_START, paper_query
 from sims.closed_loop import rollout
-from sims.figures import draw_plan
+from sims.pictures.plan_figure import draw_plan
 
 # %% [markdown]
 # ## Facing the goal

@@ -24,7 +24,7 @@ from ocp import exact_trajectory
 from ocp.eikonal import solve_eikonal
 from ocp.query_family import PAPER_FIGURE_STARTS, paper_query
 from sims.closed_loop import rollouts
-from sims.figures import draw_plan, least_over_other_coordinates
+from sims.pictures.plan_figure import draw_plan, least_over_other_coordinates
 
 query = paper_query((1.3, 3.4))
 starts = [np.array(s) for s in PAPER_FIGURE_STARTS]

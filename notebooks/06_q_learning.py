@@ -21,8 +21,8 @@ from importlib import resources
 import matplotlib.pyplot as plt
 import numpy as np
 
-from sims.regulate import HISTORY, LEARNERS, run
-from sims.system_file import SystemFile
+from sims.regulation.regulate import HISTORY, LEARNERS, run
+from sims.regulation.system_file import SystemFile
 
 path = resources.files("sims") / "systems" / "double-integrator-1d.toml"
 system = SystemFile.load(str(path))

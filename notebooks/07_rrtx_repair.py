@@ -24,7 +24,7 @@ from planners.solids import Solid
 from planners.world import SceneWorld
 from sims.benchmarks.rrtx_maps import HALF, obstacles_20
 from sims.benchmarks.visibility_graph import shortest_way
-from sims.planner_figure import draw_planner
+from sims.pictures.planner_figure import draw_planner
 
 problem = obstacles_20(0)
 box = np.full(2, HALF)

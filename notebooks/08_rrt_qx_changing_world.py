@@ -24,10 +24,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import HTML, display
 
-from sims.navigate import run
-from sims.navigation_figure import draw_frames
-from sims.navigation_replay import save_replay
-from sims.scenario_file import Scenario
+from sims.navigation.figure import draw_frames
+from sims.navigation.navigate import run
+from sims.navigation.replay import save_replay
+from sims.navigation.scenario_file import Scenario
 
 scenario = Scenario.load(str(resources.files("sims") / "scenarios" / "figure-2.toml"))
 runs = {

@@ -61,7 +61,7 @@ class Plan(Common):
     """Address of a Dask scheduler, whose workers find the exact optima."""
 
     def run(self) -> int:
-        from sims.plan import run
+        from sims.commands.plan import run
 
         return run(self)
 
@@ -92,7 +92,7 @@ class Regulate(Common):
     """q-learning (the law that converges), paper-literal or paper-repaired."""
 
     def run(self) -> int:
-        from sims.regulate_command import run
+        from sims.commands.regulate import run
 
         return run(self)
 
@@ -110,7 +110,7 @@ class Navigate(Common):
     """q-learning (the law that converges), paper-literal, paper-repaired, riccati or open-loop."""
 
     def run(self) -> int:
-        from sims.navigate_command import run
+        from sims.commands.navigate import run
 
         return run(self)
 
@@ -128,7 +128,7 @@ class Reproduce(Common):
     """Fewer starts, queries and repetitions: minutes instead of an hour."""
 
     def run(self) -> int:
-        from sims.reproduce import run
+        from sims.commands.reproduce import run
 
         return run(self)
 
@@ -149,7 +149,7 @@ class Bench(Common):
     """A result (bench.json) to compare with: prints what moved by more than noise."""
 
     def run(self) -> int:
-        from sims.bench import run
+        from sims.commands.bench import run
 
         return run(self)
 
@@ -182,7 +182,7 @@ class Store(Common):
     """fill: a Dask scheduler's address, such as tcp://127.0.0.1:8786, instead of --workers."""
 
     def run(self) -> int:
-        from sims.store_command import run
+        from sims.commands.store import run
 
         return run(self)
 
@@ -201,7 +201,7 @@ class Live(Common):
     """End by itself after so many seconds."""
 
     def run(self) -> int:
-        from sims.live import run
+        from sims.live.window import run
 
         return run(self)
 
@@ -222,7 +222,7 @@ class Train(Common):
     """A Dask scheduler's address, such as tcp://127.0.0.1:8786, instead of --workers."""
 
     def run(self) -> int:
-        from sims.train_command import run
+        from sims.commands.train import run
 
         return run(self)
 

@@ -66,7 +66,7 @@ class Rollout:
         """A matplotlib figure of this loop, the optimum dashed beside it if given."""
         import matplotlib.pyplot as plt
 
-        from sims.figures import draw_plan, legend
+        from sims.pictures.plan_figure import draw_plan, legend
 
         figure, axes = plt.subplots(figsize=(6.4, 6.0), layout="constrained")
         draw_plan(axes, self.query, [self], [optimum])

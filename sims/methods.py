@@ -130,7 +130,7 @@ def _mpc_value() -> OneShot:
 
 
 def _interpolation() -> Planner:
-    from learning.interpolation import InterpolationPlanner
+    from learning.faithful.interpolation import InterpolationPlanner
 
     return InterpolationPlanner()
 
@@ -153,7 +153,7 @@ def _refmm() -> Planner:
 
 
 def _trpo() -> OneShot:
-    from learning.trpo import RolloutValue, TrpoPolicy, TrpoWeights
+    from learning.trpo.policy import RolloutValue, TrpoPolicy, TrpoWeights
 
     weights = TrpoWeights.load()
 
@@ -191,7 +191,7 @@ METHODS: dict[str, Method] = {
 
 def default_method(query: Query) -> tuple[str, str | None]:
     """The method used where none is asked for, and why it is not `adapt` if it is not."""
-    from learning.query_encoder import why_not_encodable
+    from learning.conditioned.query_encoder import why_not_encodable
 
     if query.is_regulation:
         return "exact", "the goal is an equilibrium"

@@ -5,8 +5,8 @@ import torch
 from references import aligned_value
 from torch import Tensor
 
-from learning.losses import Derivative, Lagrangian, Reduction, Samples, Structure
-from learning.value_network import Activation, Architecture, Parameters
+from learning.faithful.losses import Derivative, Lagrangian, Reduction, Samples, Structure
+from learning.faithful.value_network import Activation, Architecture, Parameters
 
 FORMS = [
     Lagrangian(0.3, reduction, derivative, activation, structure)

@@ -119,7 +119,7 @@ def test_dangerous_model_names_are_only_names() -> None:
 def test_any_value_anywhere_in_a_system_file(data: st.DataObject, tmp_path_factory) -> None:
     import tomli_w
 
-    from sims.system_file import SystemFile
+    from sims.regulation.system_file import SystemFile
 
     good = {
         "A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "M": [[1.0, 0.0], [0.0, 1.0]],

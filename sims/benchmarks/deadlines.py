@@ -93,7 +93,7 @@ def _figure(rows: list[dict[str, Any]], out: Path) -> None:
     """The distributions: part of calls against lateness."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import save
+    from sims.pictures.plan_figure import save
 
     figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
     for row in rows:

@@ -5,13 +5,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from learning.faithful_planner import PRETRAINED, REPAIRED
-from learning.meta import MetaWeights
+from learning.faithful.meta import MetaWeights
+from learning.faithful.planner import PRINTED, REPAIRED
 from sims.benchmarks import Report
-from sims.faithful_study import COUNTS, Row, evaluate, fresh_trials, table_of
+from sims.experiments.faithful_study import COUNTS, Row, evaluate, fresh_trials, table_of
 
 QUERIES, STARTS = 20, 10
-SHIPPED = {"as printed": PRETRAINED, "repaired": REPAIRED}
+SHIPPED = {"as printed": PRINTED, "repaired": REPAIRED}
 notes = Console(stderr=True)
 
 
@@ -41,7 +41,7 @@ def _figure(curves: dict[str, list[Row]], out: Path) -> None:
     """Success and value error against the number of trajectories."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import save
+    from sims.pictures.plan_figure import save
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.0), layout="constrained")
     for (name, rows), marker in zip(curves.items(), "os", strict=True):

@@ -171,7 +171,7 @@ def _figure(rows: list[dict[str, Any]], out: Path) -> None:
     """Value error against time, both eikonal schemes and the set-valued method."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import save
+    from sims.pictures.plan_figure import save
 
     figure, axes = plt.subplots(figsize=(6.4, 4.6), layout="constrained")
     markers = dict(zip(dict.fromkeys(r["solver"] for r in rows), "sDvo^", strict=False))

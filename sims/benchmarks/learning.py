@@ -210,7 +210,7 @@ def _curve(report: Report, name: str, seed: int, out: Path | None) -> None:
 def _figure(name: str, rows: list[dict[str, Any]], out: Path) -> None:
     import matplotlib.pyplot as plt
 
-    from sims.figures import save
+    from sims.pictures.plan_figure import save
 
     figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
     markers = {"adapt": "o", "adapt without grids": "^", "eikonal": "s"}

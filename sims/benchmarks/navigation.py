@@ -1,13 +1,13 @@
 """RRT-Q^X: random dynamic scenarios, the paper's rules and ours, crowds, several robots.
 
-The whole takes some hours of one core; `python -m sims.navigation_study PART --scenarios N` less.
+The whole takes some hours of one core; `python -m sims.navigation.study PART --scenarios N` less.
 """
 
 from pathlib import Path
 from typing import Any
 
 from sims.benchmarks import Report
-from sims.navigation_study import PARTS, Ledger, failures
+from sims.navigation.study import PARTS, Ledger, failures
 
 
 def run(seed: int, out: Path | None) -> Report:  # noqa: ARG001 (scenarios have seeds of their own)

@@ -149,7 +149,7 @@ def _figure(rows: list[dict[str, Any]], out: Path) -> None:
     """Error against the spacing and against time, side by side, one row a truth."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import save
+    from sims.pictures.plan_figure import save
 
     names = list(dict.fromkeys(row["case"] for row in rows))
     spacings = 10 / np.array(CELLS)

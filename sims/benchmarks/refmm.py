@@ -300,7 +300,7 @@ def _figure(rows: list[dict[str, Any]], query: Query, out: Path) -> None:
     """Error and excess against size, and a slice of a refined mesh."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import save
+    from sims.pictures.plan_figure import save
 
     figure, axes = plt.subplots(1, 3, figsize=(13.2, 4.3), layout="constrained")
     styles = {"uniform": ("o", "-"), "refined, box": ("s", "--"), "refined, start": ("^", ":")}
@@ -331,7 +331,7 @@ def _figure(rows: list[dict[str, Any]], query: Query, out: Path) -> None:
 
 def _slice(panel: Any, query: Query) -> None:
     """The smallest leaf over all headings at each position, and the way from the start."""
-    from sims.figures import draw_plan
+    from sims.pictures.plan_figure import draw_plan
 
     start = np.array(PAPER_START)
     solution = solve_refmm(query, [start], RefmmSettings(last=COARSE)).solution

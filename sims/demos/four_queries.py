@@ -7,8 +7,8 @@ import numpy as np
 from rich.table import Table
 
 from ocp.query_family import PAPER_FIGURE_STARTS, PAPER_GOALS, PAPER_START, paper_query
+from sims.commands.plan import Outcome, number, solve
 from sims.demos import Demonstration
-from sims.plan import Outcome, number, solve
 
 PAPER_CLAIMS = {
     (4.0, 4.0): (24.0, 24.9),
@@ -74,7 +74,7 @@ def _four_panels(panels: list, out: Path) -> None:
     """One panel a query, as the paper's Figure 1."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import draw_plan, legend, save
+    from sims.pictures.plan_figure import draw_plan, legend, save
 
     figure, axes = plt.subplots(2, 2, figsize=(10.4, 9.6), layout="constrained")
     for panel, (answer, outcomes), tag in zip(axes.flat, panels, "abcd", strict=True):

@@ -26,7 +26,7 @@ def run(seed: int, out: Path | None) -> Demonstration:
     record.add("grown", planner.construction, planner)
     replay = None
     if out is not None:
-        from sims.planner_replay import PlannerReplay
+        from sims.pictures.planner_replay import PlannerReplay
 
         replay = PlannerReplay(planner)
         replay.record(0.0)
@@ -140,14 +140,14 @@ class _Pictures:
         self._axes = iter(axes.flat)
 
     def add(self, name: str, planner: RRTX) -> None:
-        from sims.planner_figure import draw_planner
+        from sims.pictures.planner_figure import draw_planner
 
         panel = next(self._axes)
         draw_planner(panel, planner, colourbar=False)
         panel.set_title(name, fontsize=11)
 
     def save(self, out: Path) -> None:
-        from sims.figures import save
+        from sims.pictures.plan_figure import save
 
         self._figure.colorbar(
             self._figure.axes[0].collections[0],

@@ -140,7 +140,7 @@ def _waits(legs: list[Leg], reaction: float | None) -> list[float]:
 def _figure(legs: list[Leg], waits: list[float], paper_waits: list[float], out: Path) -> None:
     import matplotlib.pyplot as plt
 
-    from sims.figures import draw_plan, save
+    from sims.pictures.plan_figure import draw_plan, save
 
     figure, (ground, bars) = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained")
     draw_plan(ground, legs[-1].query, [leg.loop for leg in legs], [None] * len(legs))

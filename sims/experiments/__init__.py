@@ -1,8 +1,8 @@
 """The tables and figures of Xu and Zhu (RSS 2022), one experiment a file, run again.
 
 An experiment measures in parts that are kept (parts.py), returns a document of plain data, and is
-drawn and tabulated from that document alone. Its entries in the paper ledger (sims/ledger.py) say
-what the paper claims, what its own tables give when recomputed, and what was found.
+drawn and tabulated from that document alone. Its entries in the paper ledger (ledger.py) say what
+the paper claims, what its own tables give when recomputed, and what was found.
 """
 
 import importlib

@@ -116,10 +116,11 @@ def _eikonal(nodes: int) -> Callable[[], Planner]:
 
 def _faithful(stem: str) -> Callable[[], Any]:
     def make() -> Any:
-        from learning.faithful_planner import PRETRAINED, FaithfulPlanner
-        from learning.meta import MetaWeights
+        from learning.faithful.meta import MetaWeights
+        from learning.faithful.planner import FaithfulPlanner
+        from learning.shipped import PRETRAINED
 
-        path = PRETRAINED.with_name(f"{stem}.safetensors")
+        path = PRETRAINED / f"{stem}.safetensors"
         if not path.is_file():
             raise FileNotFoundError("no trained weights are shipped for the paper's meta learning")
         return FaithfulPlanner(MetaWeights.load(path))

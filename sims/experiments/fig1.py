@@ -87,7 +87,7 @@ def draw(document: dict[str, Any], out: Path) -> list[Path]:
     """Four panels for each planner, as the paper's figure."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import draw_plan, legend, save_all
+    from sims.pictures.plan_figure import draw_plan, legend, save_all
 
     written = []
     for key, panels in document["figures"].items():

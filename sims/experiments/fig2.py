@@ -202,7 +202,7 @@ def draw(document: dict[str, Any], out: Path) -> list[Path]:
     """Excess against time on logarithmic axes."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import save_all
+    from sims.pictures.plan_figure import save_all
 
     figure, axes = plt.subplots(figsize=(6.8, 4.6), layout="constrained")
     colours = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#882255", "#56B4E9")

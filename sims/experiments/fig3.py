@@ -257,7 +257,7 @@ def draw(document: dict[str, Any], out: Path) -> list[Path]:
     """The four panels."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import save_all
+    from sims.pictures.plan_figure import save_all
 
     figure, ((a, b), (c, d)) = plt.subplots(2, 2, figsize=(8.4, 6.6), layout="constrained")
     colours = {1: "#0072B2", 2: "#E69F00", 4: "#009E73"}

@@ -28,9 +28,9 @@ def run(setting: Setting, parts: Parts) -> Findings:
 
 
 def _one(controller: str, setting: Setting, pictures: Path | None) -> dict[str, Any]:
-    from sims import navigate
-    from sims.navigation_figure import save_pictures
-    from sims.scenario_file import Scenario
+    from sims.navigation import navigate
+    from sims.navigation.figure import save_pictures
+    from sims.navigation.scenario_file import Scenario
 
     scenario = Scenario.load(SCENARIO)
     runs = navigate.run(scenario, controller, setting.seed, record=pictures is not None)

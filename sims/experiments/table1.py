@@ -57,7 +57,7 @@ def draw(document: dict[str, Any], out: Path) -> list[Path]:
     """Excess over the optimum, a bar for each goal: ours, and the paper's as an open mark."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import save_all
+    from sims.pictures.plan_figure import save_all
 
     optima = np.array([np.nan if o is None else o for o in document["optima"]])
     rows = [r for r in document["rows"] if not r["absent"]]

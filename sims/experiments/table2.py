@@ -100,8 +100,8 @@ def _generation(workers: int, repeats: int, seed: int) -> dict[str, Any]:
 
 def _training() -> dict[str, float | None]:
     """Seconds of training, from the records in the shipped weights."""
-    from learning.trpo import PRETRAINED as TRPO_WEIGHTS
-    from learning.trpo import TrpoWeights
+    from learning.trpo.policy import TRAINED as TRPO_WEIGHTS
+    from learning.trpo.policy import TrpoWeights
 
     trpo = TrpoWeights.load().provenance["last"]["seconds"] if TRPO_WEIGHTS.is_file() else None
     return {"trpo": trpo}
@@ -153,7 +153,7 @@ def draw(document: dict[str, Any], out: Path) -> list[Path]:
     """Bars on a logarithmic axis: ours, and the paper's."""
     import matplotlib.pyplot as plt
 
-    from sims.figures import save_all
+    from sims.pictures.plan_figure import save_all
 
     rows: list[tuple[str, float, float | None]] = [
         (row["label"], row["seconds"], TABLE_II.get(row["paper_row"] or ""))

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from learning import MetaPlanner
+from learning.conditioned.pretrained_weights import MOST_BYTES, load_pretrained
 from learning.meta_planner import Clock, Step
-from learning.pretrained_weights import FOLDER, MOST_BYTES, load_pretrained
+from learning.shipped import PRETRAINED
 from ocp import Goal, Obstacle, Query, SolveError, exact_trajectory, iterations, trajectories
 from ocp.family_file import load_family
 from ocp.query_family import PAPER_START, paper_query, sample_start
@@ -111,7 +112,7 @@ def test_other_robots_are_refused():
 @pytest.mark.parametrize("name", FAMILIES)
 def test_shipped_weights_are_small_and_say_where_they_come_from(name):
     made = load_pretrained(name)
-    assert (FOLDER / f"{name}.safetensors").stat().st_size <= MOST_BYTES
+    assert (PRETRAINED / f"{name}.safetensors").stat().st_size <= MOST_BYTES
     for key in ("command", "data_sha256", "settings", "held_out"):
         assert key in made.provenance
 

@@ -9,9 +9,9 @@ from references import TABLE_ONE_OPTIMA
 
 from ocp.planning import OneShot
 from ocp.trajectory import SolveError, Status
-from sims import ledger as ledgers
-from sims import reproduce
+from sims.commands import reproduce
 from sims.experiments import EXPERIMENTS, Setting, experiment, fig2, fig3, table1
+from sims.experiments import ledger as ledgers
 from sims.experiments.contestants import CONTESTANTS, NEVER, Contestant, contestant
 from sims.experiments.paper import GOALS, TABLE_I
 from sims.experiments.parts import Parts

@@ -1,0 +1,1 @@
+"""The main method's network: a value function that knows its query."""

@@ -1,0 +1,165 @@
+"""Samples of optimal values to learn from: cheap, since a grid solves a query in milliseconds.
+
+Each query is solved twice by fast marching: over its whole domain, and finely around its goal.
+States are drawn uniformly, along closed loops (where policies will be), and near the goal. At
+states where the gradient of the grid does not satisfy the Hamilton-Jacobi equation, V is not
+smooth (two classes of motions cost about the same); there only the value is learned.
+
+Between nodes V minus the exact value without obstacles is interpolated: unlike V, this difference
+is smooth at the goal.
+"""
+
+import hashlib
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from learning.conditioned.query_encoder import REACH
+from ocp.compiled.batch import rates, state_costs
+from ocp.eikonal import solve_eikonal
+from ocp.extremals.warm_start import rollouts
+from ocp.family_file import load_family
+from ocp.grid import Grid, GridValue
+from ocp.grids.goal_table import GoalTable, goal_table
+from ocp.query import Query
+from ocp.query_family import sample_start
+from ocp.query_file import query_to_dict
+
+Floats = NDArray[np.float64]
+
+MARGIN = 0.5  # metres beyond the domain: optimal motions may leave it
+AROUND = 1.0  # metres: the fine grid's border around the goal
+FINE_NODES = 20_000
+NEAR, FAR = 0.03, 0.6  # metres from the goal of the samples from the fine grid
+LOOPS = 12
+SCATTER = (0.1, 0.1, 0.2)  # of states off their closed loops
+RESIDUAL = 0.06  # relative, of the Hamilton-Jacobi equation where V is smooth
+
+
+@dataclass(frozen=True)
+class SampleSizes:
+    """How much data is made.
+
+    Attributes:
+        queries: with at least one obstacle each (without any the value is known).
+        states: a query.
+        nodes: of the grid over the whole domain.
+    """
+
+    queries: int
+    states: int
+    nodes: int
+
+
+@dataclass(frozen=True)
+class ValueSamples:
+    """States of one query with what is known of V there.
+
+    Attributes:
+        states: `[k, 3]`.
+        values: `[k]`, V.
+        slopes: `[k, m]`, grad V' G, the derivatives along the inputs' directions.
+        smooth: `[k]`, whether `slopes` can be trusted.
+    """
+
+    states: Floats
+    values: Floats
+    slopes: Floats
+    smooth: NDArray[np.bool_]
+
+
+def input_directions(query: Query, states: Floats) -> Floats:
+    """The columns of G(x): `[k, n, m]` at states `[k, n]` of a robot without drift."""
+    units = np.eye(query.system.m)
+    columns = [rates(query, states, np.tile(u, (len(states), 1))) for u in units]
+    return np.stack(columns, axis=-1)
+
+
+def sample_values(query: Query, sizes: SampleSizes, rng: np.random.Generator) -> ValueSamples:
+    """Samples of one query."""
+    coarse = solve_eikonal(query, Grid.for_query(query, sizes.nodes, margin=MARGIN))
+    fine = solve_eikonal(query, _around_goal(query)).value.on_grid
+    near_count, loop_count = sizes.states // 5, 2 * sizes.states // 5
+    anywhere = sizes.states - near_count - loop_count
+    starts = np.array([sample_start(query, rng) for _ in range(max(anywhere, LOOPS))])
+    loops = [r for r in rollouts(query, coarse.policy(), starts[:LOOPS]) if r is not None]
+    path = np.concatenate([starts[:1], *(r.states for r in loops)])
+    followed = path[rng.integers(len(path), size=loop_count)]
+    followed = followed + rng.normal(size=followed.shape) * SCATTER
+    angles, headings = rng.uniform(-np.pi, np.pi, (2, near_count))
+    gaps = np.exp(rng.uniform(np.log(NEAR), np.log(FAR), near_count))
+    radius = (query.goal.radius + gaps)[:, None]
+    place = query.reference[:2] + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    near = np.column_stack([place, headings])
+    table = goal_table(query, REACH)
+    parts = [
+        _known(query, table, coarse.value.on_grid, np.concatenate([starts[:anywhere], followed])),
+        _known(query, table, fine, near),
+    ]
+    return ValueSamples(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ValueSamples))
+    )
+
+
+def _around_goal(query: Query) -> Grid:
+    """A fine grid over a square around the goal and half a turn of headings."""
+    whole = Grid.for_query(query, FINE_NODES)
+    center, reach = query.reference[:2], query.goal.radius + AROUND
+    headings = max(9, whole.shape[2])
+    side = round((FINE_NODES / headings) ** 0.5)
+    return Grid(
+        (*map(float, center - reach), whole.lower[2]),
+        (*map(float, center + reach), whole.upper[2]),
+        (side, side, headings),
+        whole.periodic,
+    )
+
+
+def _known(query: Query, table: GoalTable, value: GridValue, states: Floats) -> ValueSamples:
+    """What a grid knows at the states that lie well in its box and outside the goal."""
+    states = states[query.goal_distance(states) > 0.5 * NEAR]
+    states = states[np.asarray(value.grid.contains(states))]
+    rise = GridValue(value.grid, value.values - table.on_product(*value.grid.axes))
+    values = rise.value(states) + table.value(states)
+    gradients = rise.gradient(states) + table.gradient(states)
+    directions = input_directions(query, states)
+    slopes = np.einsum("kn,knm->km", gradients, directions)
+    effort = 0.5 * np.linalg.norm(slopes / np.sqrt(query.input_weights), axis=1)
+    needed = np.sqrt(state_costs(query, states))
+    shift = value.grid.spacing * [1, 1, 0]  # as far as the gradient reaches
+    smooth = np.abs(effort - needed) < RESIDUAL * needed
+    smooth &= np.asarray(value.grid.contains(states + shift))
+    smooth &= np.asarray(value.grid.contains(states - shift))
+    return ValueSamples(states, values, slopes, smooth)
+
+
+@dataclass(frozen=True)
+class SampleTask:
+    """The k-th query of a family, and its samples: they depend on these numbers only."""
+
+    family: str
+    sizes: SampleSizes
+    seed: int
+    number: int
+
+
+def sample_query(task: SampleTask) -> tuple[dict[str, Any], ValueSamples]:
+    """The query, as the tables of a query file, and its samples."""
+    rng = np.random.default_rng([task.seed, task.number])
+    family = load_family(task.family)
+    query = family.sample(rng)
+    while not query.obstacles:
+        query = family.sample(rng)
+    return query_to_dict(query), sample_values(query, task.sizes, rng)
+
+
+def digest(samples: list[tuple[Query, ValueSamples]]) -> str:
+    """A hash of everything sampled."""
+    total = hashlib.sha256()
+    for query, known in samples:
+        total.update(query.dumps().encode())
+        for f in fields(known):
+            total.update(np.ascontiguousarray(getattr(known, f.name)).tobytes())
+    return total.hexdigest()

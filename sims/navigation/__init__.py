@@ -1,0 +1,1 @@
+"""RRT-Q^X in Drake's Simulator: scenarios, diagram, controllers, pictures, study."""

@@ -1,0 +1,1 @@
+"""Figures and replays of plans and of RRT^X."""

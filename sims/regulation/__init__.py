@@ -1,0 +1,1 @@
+"""Linear regulation by learned gains against Riccati: system files, simulation, study."""
