@@ -17,6 +17,7 @@ from ocp.kernels import kernels, parameters
 from ocp.query import Query
 from ocp.trajectory import Status, Trajectory
 from ocp.value import Policy
+from sims.disturbance import Disturbance, DisturbedLoops
 
 GOAL_TOLERANCE = 1e-3
 """Metres: the goal ball counts as hit within this distance of it."""
@@ -104,12 +105,23 @@ def rollout(policy: Policy, start: ArrayLike, settings: LoopSettings | None = No
 
 
 def rollouts(
-    policy: Policy, starts: Sequence[ArrayLike], settings: LoopSettings | None = None
+    policy: Policy,
+    starts: Sequence[ArrayLike],
+    settings: LoopSettings | None = None,
+    disturbance: Disturbance | None = None,
+    seed: int = 0,
 ) -> list[Rollout]:
     """Closed loops from many starts `[n]`, all advanced together by compiled Runge-Kutta steps.
 
+    Args:
+        policy: the policy.
+        starts: states in the policy's domain.
+        settings: how the loop is closed.
+        disturbance: what is wrong with the robot and its sensors; by default nothing.
+        seed: of the disturbance's random numbers.
+
     Raises:
-        ValueError: if a start does not fit the policy's query.
+        ValueError: if a start or the disturbance does not fit the policy's query.
     """
     settings = settings or LoopSettings()
     query = policy.query
@@ -123,10 +135,15 @@ def rollouts(
     rows[:, :-1] = states
     active = np.flatnonzero(query.goal_distance(states) > GOAL_TOLERANCE)
     pieces: list[list[tuple[NDArray, NDArray, NDArray]]] = [[] for _ in range(count)]
+    world = None
+    if disturbance is not None:
+        world = DisturbedLoops(disturbance, query, count, settings.period, seed)
     for k in range(steps):
         if not len(active):
             break
-        inputs = np.require(policy(rows[active, :-1]), dtype=float, requirements=["C", "W"])
+        here = rows[active, :-1]
+        found = policy(here) if world is None else world.inputs(k, policy, active, here)
+        inputs = np.require(found, dtype=float, requirements=["C", "W"])
         if not np.isfinite(inputs).all():
             raise FloatingPointError(f"the policy returned a non-finite input at step {k}")
         path = np.empty((len(active), substeps + 1, system.n + 1))
@@ -151,6 +168,8 @@ def rollouts(
             pieces[index].append((times, path[i, : last + 1], inputs[i]))
             rows[index] = path[i, last]
         active = active[query.goal_distance(rows[active, :-1]) > GOAL_TOLERANCE * (1 + 1e-9)]
+        if world is not None:
+            rows[active, :-1] = world.push(k, active, rows[active, :-1])
     return [_assemble(query, start, piece) for start, piece in zip(states, pieces, strict=True)]
 
 
