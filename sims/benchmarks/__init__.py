@@ -25,6 +25,7 @@ BENCHMARKS: dict[str, str] = {
     "orders": "orders of convergence of the grid schemes, on and off the axis",
     "refmm": "ReFMM: orders, refined against uniform meshes, repair against a new solve",
     "robots": "robots from SDF and URDF: evaluation and transcription, against Drake",
+    "robustness": "closed loops under model error, noise, delay and saturation, every method",
     "rrtx": "RRT^X: repair after changes, against growth from scratch, OMPL and the optimum",
     "startup": "processor time and memory of zermelo --help and of each package's import",
     "store": "value store: time and bytes an entry, kills survived",
