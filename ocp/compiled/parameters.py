@@ -48,16 +48,21 @@ class Layout:
 
     @classmethod
     def of(cls, query: Query) -> "Layout":
-        system = query.system
-        return cls(
-            system.n,
-            system.m,
-            len(system.position),
-            query.cost.state is not None,
-            query.is_bounded,
-            query.is_regulation,
-            str(query.cost.own),
-        )
+        return _layout(query)
+
+
+@lru_cache(maxsize=256)
+def _layout(query: Query) -> Layout:
+    system = query.system
+    return Layout(
+        system.n,
+        system.m,
+        len(system.position),
+        query.cost.state is not None,
+        query.is_bounded,
+        query.is_regulation,
+        str(query.cost.own),
+    )
 
 
 def parameters(query: Query) -> NDArray[np.float64]:

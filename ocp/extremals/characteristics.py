@@ -114,7 +114,7 @@ def _grow(kind, functions, q, layout, terms, ends, tolerance, limits, record, le
     integrate = propagate_at(functions[3, 0], functions[3, 1])
     on_manifold = terminal_at(functions[4, 0], functions[4, 1])
     y, edge = np.zeros(2 * n + 1), np.empty((2 * n, n - 1))
-    no_tangents = np.empty((2 * n, 0))
+    no_tangents, pace = np.empty((2 * n, 0)), np.zeros(1)
     for row in range(ends.shape[0]):
         if not on_manifold(kind, functions, q, layout, terms, ends[row], y[: 2 * n], edge):
             continue
@@ -122,7 +122,9 @@ def _grow(kind, functions, q, layout, terms, ends, tolerance, limits, record, le
         record[row, 0, 0] = 0.0
         record[row, 0, 1:] = y
         # So long a duration that a limit, or the end of the record, comes first.
-        integrate(functions, q, layout, y, no_tangents, -1e6, tolerance, limits, record[row, 1:])
+        pace[0] = 0.0
+        steps = record[row, 1:]
+        integrate(functions, q, layout, y, no_tangents, -1e6, tolerance, pace, limits, steps)
         for point in range(record.shape[1]):
             if not np.isnan(record[row, point, 0]):
                 lengths[row] += 1

@@ -6,12 +6,14 @@ on the terminal manifold (transversality.py), and H = 0 if the final time is fre
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ocp.compiled.batch import optimal_inputs, rates, running_costs
+from ocp.extremals.first_iterate import first_nodes, with_costates
 from ocp.extremals.hamiltonian_flow import flow_layout
+from ocp.extremals.second_look import SecondLook, look_again
 from ocp.extremals.shooting import (
     BROKEN,
     CONVERGED,
@@ -19,10 +21,9 @@ from ocp.extremals.shooting import (
     SINGULAR,
     shoot,
     shooting_addresses,
-    trace,
 )
 from ocp.extremals.transversality import NEGLIGIBLE, Condition, goal_condition
-from ocp.extremals.warm_start import until_goal, with_costates
+from ocp.extremals.warm_start import until_goal
 from ocp.kernels import parameters
 from ocp.query import Query
 from ocp.trajectory import Status, Trajectory
@@ -57,9 +58,8 @@ class Extremal:
         iterations: of Newton's method.
         seconds: spent in them.
         trajectory: with costates; `None` unless solved.
-        hessian: `[n, n]`, second derivatives of V at the start; `None` unless solved.
-        hessians: `[segments, n, n]`, the same where the segments begin: at every `SAMPLES`-th point
-            of the trajectory but the last (on the goal's boundary they do not exist).
+        tangents: `[segments, 2n, n]`, of the field of extremals where the segments begin; `None`
+            unless solved.
         bounds_active: whether the input touches a bound somewhere. The flow is then only once
             differentiable there, and the extremal as valid.
     """
@@ -69,14 +69,32 @@ class Extremal:
     iterations: int = 0
     seconds: float = 0.0
     trajectory: Trajectory | None = None
-    hessian: Array | None = None
-    hessians: Array | None = None
+    tangents: Array | None = None
     bounds_active: bool = False
 
     @property
     def cost(self) -> float:
         """Cost of the motion; infinite unless solved."""
         return np.inf if self.trajectory is None else self.trajectory.cost
+
+    @cached_property
+    def hessians(self) -> Array | None:
+        """Second derivatives of V `[segments, n, n]` where the segments begin, at every
+        `SAMPLES`-th point of the trajectory but the last (on the goal's boundary there are none).
+
+        `None` unless solved.
+        """
+        if self.tangents is None:
+            return None
+        n = self.tangents.shape[2]
+        turned = self.tangents.transpose(0, 2, 1)
+        hessians = np.linalg.solve(turned[:, :, :n], turned[:, :, n:])
+        return (hessians + hessians.transpose(0, 2, 1)) / 2
+
+    @property
+    def hessian(self) -> Array | None:
+        """Second derivatives of V `[n, n]` at the start; `None` unless solved."""
+        return None if self.hessians is None else self.hessians[0]
 
 
 def find_extremal(
@@ -121,13 +139,11 @@ def find_extremal(
     status, detail = _verdict(query, condition, shot.motion, shot.basis)
     if status is not Status.SOLVED:
         return Extremal(status, detail, iterations, seconds)
-    lower, upper = query.input_bounds
-    active = bool(((shot.motion.inputs <= lower) | (shot.motion.inputs >= upper)).any())
-    n = query.system.n
-    transposed = shot.basis[:-1].transpose(0, 2, 1)
-    hessians = np.linalg.solve(transposed[:, :, :n], transposed[:, :, n:-1]).transpose(0, 2, 1)
-    hessians = (hessians + hessians.transpose(0, 2, 1)) / 2
-    return Extremal(status, "", iterations, seconds, shot.motion, hessians[0], hessians, active)
+    active = False
+    if query.is_bounded:
+        lower, upper = query.input_bounds
+        active = bool(((shot.motion.inputs <= lower) | (shot.motion.inputs >= upper)).any())
+    return Extremal(status, "", iterations, seconds, shot.motion, shot.basis[:-1, :-1], active)
 
 
 @dataclass(frozen=True)
@@ -150,12 +166,12 @@ def _shoot(
     settings: Array,
 ) -> _Shot:
     n = query.system.n
-    fractions, nodes = _nodes(guess, segments)
+    fractions, nodes = first_nodes(guess, segments)
     end = guess.states[-1].copy()
     basis = np.zeros((segments + 1, 2 * n + 1, n))
     functions, q, layout = shooting_addresses(query), parameters(query), flow_layout(query)
     # Near the goal costates and costs are small themselves.
-    small = float(np.clip(guess.cost, 1e-5, 1.0)) if condition.at_goal else 1.0
+    small = min(max(guess.cost, 1e-5), 1.0) if condition.at_goal else 1.0
     settings = settings * [small, small, 1.0, 1.0]
     begun = time.perf_counter()
     ended, iterations, duration, _ = shoot(
@@ -167,61 +183,24 @@ def _shoot(
         detail = WHY.get(ended, f"no convergence in {iterations} iterations")
         return _Shot(iterations, seconds, detail, None, basis)
     nodes[0, :n] = start
-    points = np.empty((segments * SAMPLES + 1, 2 * n + 1))
-    gap = trace(
-        functions, q, layout, fractions, nodes, duration, SAMPLES, small * CHECK_TOLERANCE, points
-    )
-    if not gap < np.inf:
+    look = look_again(query, fractions, nodes, duration, SAMPLES, small * CHECK_TOLERANCE)
+    if not look.gap < np.inf:
         return _Shot(iterations, seconds, "the answer could not be integrated again", None, basis)
-    marks = np.arange(segments * SAMPLES + 1) / SAMPLES
-    motion = Trajectory(
-        duration * np.interp(marks, np.arange(segments + 1), fractions),
-        points[:, :n].copy(),
-        optimal_inputs(query, points[:, :n], points[:, n:-1]),
-        points[:, n:-1].copy(),
-        points[:, -1].copy(),
-    )
     detail = ""
-    off, allowed = _hamiltonian_error(query, condition, motion)
-    if not gap <= MAX_GAP:
-        detail = f"integrated again, nodes are missed by {gap:.1e}"
+    off, allowed = _hamiltonian_error(condition, look)
+    if not look.gap <= MAX_GAP:
+        detail = f"integrated again, nodes are missed by {look.gap:.1e}"
     elif not off <= allowed:
         detail = f"the Hamiltonian is off by {off:.1e}"
-    return _Shot(iterations, seconds, detail, motion, basis)
+    return _Shot(iterations, seconds, detail, look.motion, basis)
 
 
-def _nodes(guess: Trajectory, segments: int) -> tuple[Array, Array]:
-    """Fractions of the duration `[N + 1]` and z there `[N + 1, 2n]`.
-
-    Segments share out time, and the change of z along the guess, equally.
-    """
-    assert guess.costates is not None
-    z = np.hstack([guess.states, guess.costates])
-    moved = np.abs(np.diff(z, axis=0)).sum(axis=1)
-    share = moved / max(moved.sum(), 1e-300) + np.diff(guess.times) / guess.duration
-    mesh = np.concatenate([[0.0], np.cumsum(share)])
-    fractions = np.interp(
-        np.linspace(0, mesh[-1], segments + 1), mesh, guess.times / guess.duration
-    )
-    fractions[0], fractions[-1] = 0.0, 1.0
-    at = fractions * guess.duration
-    return fractions, np.column_stack([np.interp(at, guess.times, c) for c in z.T])
-
-
-def _hamiltonian_error(
-    query: Query, condition: Condition, motion: Trajectory
-) -> tuple[float, float]:
-    """By how much H is off along a motion (0 at the goal, else constant), and the error allowed.
-
-    H is made from the definitions of dynamics and running cost, which the flow was derived from.
-    """
-    x, u, p = motion.states, motion.inputs, motion.costates
-    assert p is not None
-    costs = running_costs(query, x, u)
-    hamiltonian = costs + (p * rates(query, x, u)).sum(axis=-1)
-    constant = 0.0 if condition.at_goal else hamiltonian[0]
-    size = costs.max() + np.abs(hamiltonian - costs).max()
-    return float(np.abs(hamiltonian - constant).max()), MAX_HAMILTONIAN * size + NEGLIGIBLE
+def _hamiltonian_error(condition: Condition, look: SecondLook) -> tuple[float, float]:
+    """By how much H is off along a motion (0 at the goal, else constant), and the error allowed."""
+    constant = 0.0 if condition.at_goal else look.hamiltonians[0]
+    size = look.costs.max() + np.abs(look.hamiltonians - look.costs).max()
+    off = np.abs(look.hamiltonians - constant).max()
+    return float(off), float(MAX_HAMILTONIAN * size + NEGLIGIBLE)
 
 
 def _verdict(
@@ -229,8 +208,7 @@ def _verdict(
 ) -> tuple[Status, str]:
     """Whether the extremal is what was asked for, and a local minimum."""
     x = motion.states
-    depth = -query.goal_distance(x[:-1]).min()
-    if condition.at_goal and depth > MAX_DEPTH * query.goal.radius:
+    if condition.at_goal and -query.goal_distance(x[:-1]).min() > MAX_DEPTH * query.goal.radius:
         return Status.WRONG_EXTREMAL, "it crosses the goal before it ends"
     n = query.system.n
     signs = np.sign(np.linalg.det(basis[:-1, :n]))

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from ocp.compiled.function_address import ADDRESSES, addresses, function_at
 from ocp.compiled.jit import KERNEL, KERNEL_WITH_JACOBIAN, MATRIX, SCALAR, VECTOR, compiled, float64
 from ocp.compiled.parameters import Layout
-from ocp.kernels import Kernels, kernels
+from ocp.kernels import Kernels
 from ocp.query import Query
 
 INTEGERS = int64[::1]
+CUBE = float64[:, :, ::1]
 
 FINISHED, LEFT, FAILED = 0, 1, 2  # how `propagate` ended
 
@@ -45,13 +46,9 @@ kernel_with_jacobian_at = function_at(KERNEL_WITH_JACOBIAN)
 scalar_at = function_at(SCALAR)
 
 
-def flow_addresses(query: Query) -> NDArray[np.intp]:
-    """The functions that `propagate` calls, and itself last, for this query."""
-    return _flow_addresses(kernels(query))
-
-
 @cache
-def _flow_addresses(k: Kernels) -> NDArray[np.intp]:
+def flow_addresses(k: Kernels) -> NDArray[np.intp]:
+    """The functions that `propagate` calls, and itself last, for this robot and form of cost."""
     return addresses([k.flow, k.flow_jacobian, k.minimised_hamiltonian, propagate])
 
 
@@ -119,11 +116,17 @@ def _excess(x, q, layout, frozen):
     return worst, which, facet
 
 
-@compiled(types.void(ADDRESSES, VECTOR, VECTOR, float64, float64, VECTOR))
-def _rate(functions, q, y, sign, energy, out):
-    """d/ds of [z, cost] at s = sign t: the running cost is H - p' x', and the flow conserves H."""
+@compiled(types.void(ADDRESSES, VECTOR, VECTOR, float64, float64, VECTOR, MATRIX))
+def _rate(functions, q, y, sign, energy, out, jacobian):
+    """d/ds of [z, cost] at s = sign t: the running cost is H - p' x', and the flow conserves H.
+
+    `jacobian` `[2n, 2n]` is filled with d(z')/dz, in t, unless it is empty.
+    """
     n = (y.shape[0] - 1) // 2
-    kernel_at(functions[0, 0], functions[0, 1])(y, q, out)
+    if jacobian.shape[0] > 0:
+        kernel_with_jacobian_at(functions[1, 0], functions[1, 1])(y, q, out, jacobian)
+    else:
+        kernel_at(functions[0, 0], functions[0, 1])(y, q, out)
     work = 0.0
     for i in range(n):
         work += y[n + i] * out[i]
@@ -132,9 +135,15 @@ def _rate(functions, q, y, sign, energy, out):
     out[2 * n] = energy - work  # counts up, forward and backward
 
 
-@compiled(float64(ADDRESSES, VECTOR, VECTOR, float64, float64, float64, float64, MATRIX, VECTOR))
-def _step(functions, q, y, h, sign, energy, tolerance, stages, out):
+@compiled(
+    float64(
+        ADDRESSES, VECTOR, VECTOR, float64, float64, float64, float64, MATRIX, CUBE, VECTOR
+    )
+)  # fmt: skip
+def _step(functions, q, y, h, sign, energy, tolerance, stages, jacobians, out):
     """One step of length h from y `[2n + 1]`; `stages[0]` holds the rate at y, the rest is filled.
+
+    So it is with `jacobians` `[7, 2n, 2n]` of the stages, or `[7, 0, 0]` if they are not wanted.
 
     Returns the error estimate over the tolerance.
     """
@@ -145,7 +154,7 @@ def _step(functions, q, y, h, sign, energy, tolerance, stages, out):
             for r in range(s):
                 total += TABLEAU[s, r] * stages[r, i]
             out[i] = y[i] + h * total
-        _rate(functions, q, out, sign, energy, stages[s])
+        _rate(functions, q, out, sign, energy, stages[s], jacobians[s])
     error = 0.0
     for i in range(size):
         estimate = 0.0
@@ -156,24 +165,15 @@ def _step(functions, q, y, h, sign, energy, tolerance, stages, out):
     return math.sqrt(error / size)
 
 
-@compiled(types.void(ADDRESSES, VECTOR, VECTOR, float64, float64, MATRIX, MATRIX, MATRIX))
-def _tangent_step(functions, q, y, h, sign, stages, tangents, scratch):
-    """The same step of the tangents `[2n, c]`, from the stages of `_step`.
+@compiled(types.void(float64, float64, CUBE, MATRIX, MATRIX))
+def _tangent_step(h, sign, jacobians, tangents, scratch):
+    """The same step of the tangents `[2n, c]`, by the stages' Jacobians.
 
     `scratch` `[7, 2n c]` is overwritten: six stages, and the argument of the next.
     """
     size, columns = tangents.shape
-    jacobian = np.empty((size, size))
-    point, unused = np.empty(size), np.empty(size)
-    linear = kernel_with_jacobian_at(functions[1, 0], functions[1, 1])
     flat, bent = tangents.reshape(-1), scratch[6]
     for s in range(6):
-        for i in range(size):
-            total = 0.0
-            for r in range(s):
-                total += TABLEAU[s, r] * stages[r, i]
-            point[i] = y[i] + h * total
-        linear(point, q, unused, jacobian)
         # Long inner loops over contiguous memory: the compiler makes vector instructions of them.
         bent[:] = flat
         for r in range(s):
@@ -185,7 +185,7 @@ def _tangent_step(functions, q, y, h, sign, stages, tangents, scratch):
         for i in range(size):
             row = stage[i * columns : (i + 1) * columns]
             for k in range(size):
-                weight = sign * jacobian[i, k]
+                weight = sign * jacobians[s, i, k]
                 if weight != 0.0:
                     source = bent[k * columns : (k + 1) * columns]
                     for j in range(columns):
@@ -240,12 +240,14 @@ def _switch(functions, q, layout, frozen, y, polygon, facet, stages, tangents):
 
 # The type of `propagate`
 PROPAGATE = types.FunctionType(
-    int64(ADDRESSES, VECTOR, INTEGERS, VECTOR, MATRIX, float64, float64, VECTOR, MATRIX)
+    int64(ADDRESSES, VECTOR, INTEGERS, VECTOR, MATRIX, float64, float64, VECTOR, VECTOR, MATRIX)
 )
 
 
-@compiled(int64(ADDRESSES, VECTOR, INTEGERS, VECTOR, MATRIX, float64, float64, VECTOR, MATRIX))
-def propagate(functions, q, layout, y, tangents, duration, tolerance, limits, record):
+@compiled(
+    int64(ADDRESSES, VECTOR, INTEGERS, VECTOR, MATRIX, float64, float64, VECTOR, VECTOR, MATRIX)
+)
+def propagate(functions, q, layout, y, tangents, duration, tolerance, pace, limits, record):
     """Carry y = [x, p, cost] `[2n + 1]` along the flow for `duration` seconds, negative: back.
 
     Args:
@@ -255,6 +257,8 @@ def propagate(functions, q, layout, y, tangents, duration, tolerance, limits, re
         y: start, replaced by the end; the cost counts up, also backward.
         tangents: `[2n, c]` perturbations of z, carried along; no columns if not wanted.
         tolerance: of a step, relative to 1 + |component|.
+        pace: `[1]`, seconds of the first step to try, 0 if that is not known; replaced by those of
+            the step that would come next. Motions in pieces are so spared small first steps.
         limits: `[1 + 2n]`: largest cost, then lower and upper bounds of x; where one is crossed the
             motion ends (LEFT). Empty for no limits.
         record: `[k, 2n + 2]`: filled with (seconds gone by, z, cost) after each step, up to k rows,
@@ -273,17 +277,22 @@ def propagate(functions, q, layout, y, tangents, duration, tolerance, limits, re
     energy = scalar_at(functions[2, 0], functions[2, 1])(y, q)
     stages, out = np.empty((7, size)), np.empty(size)
     scratch = np.empty((7, 2 * n * tangents.shape[1]))
+    wanted = 2 * n if tangents.shape[1] > 0 else 0
+    jacobians = np.empty((7, wanted, wanted))
     gone, rows, rejected = 0.0, 0, 0
-    _rate(functions, frozen, y, sign, energy, stages[0])
-    fastest = 0.0
-    for i in range(2 * n):
-        fastest = max(fastest, abs(stages[0, i]) / (1.0 + abs(y[i])))
-    h = min(length, tolerance**0.2 / (1e-3 + fastest))
+    _rate(functions, frozen, y, sign, energy, stages[0], jacobians[0])
+    h = pace[0]
+    if h == 0.0:
+        fastest = 0.0
+        for i in range(2 * n):
+            fastest = max(fastest, abs(stages[0, i]) / (1.0 + abs(y[i])))
+        h = tolerance**0.2 / (1e-3 + fastest)
     for _ in range(MAX_STEPS):
+        proposed = h
         h = min(h, length - gone)
         if length - gone - h < 1e-3 * h:
             h = length - gone
-        error = _step(functions, frozen, y, h, sign, energy, tolerance, stages, out)
+        error = _step(functions, frozen, y, h, sign, energy, tolerance, stages, jacobians, out)
         if not error <= 1.0:
             rejected += 1
             if rejected == MAX_REJECTIONS:
@@ -293,6 +302,8 @@ def propagate(functions, q, layout, y, tangents, duration, tolerance, limits, re
         rejected = 0
         growth = min(5.0, 0.9 * max(error, 1e-10) ** -0.2)
         following = h * growth
+        if h < proposed:  # cut short by the end, not by its error
+            following = max(following, proposed)
         gap, polygon, facet = _excess(out, q, layout, frozen)
         crossed = gap > LEVEL
         if crossed:
@@ -304,7 +315,7 @@ def propagate(functions, q, layout, y, tangents, duration, tolerance, limits, re
                 middle = high - at_high * (high - low) / (at_high - at_low)
                 if at_low > -LEVEL:  # already level at the start: does it rise at once?
                     middle = low + 0.1 * (high - low)
-                _step(functions, frozen, y, middle, sign, energy, tolerance, stages, out)
+                _step(functions, frozen, y, middle, sign, energy, tolerance, stages, jacobians, out)
                 gap, o, i = _excess(out, q, layout, frozen)
                 if gap > 0.0:
                     at_low *= 0.5 if side == 1 else 1.0
@@ -314,16 +325,18 @@ def propagate(functions, q, layout, y, tangents, duration, tolerance, limits, re
                     at_high *= 0.5 if side == -1 else 1.0
                     low, at_low, side = middle, gap, -1
             h = high
-            _step(functions, frozen, y, h, sign, energy, tolerance, stages, out)
+            _step(functions, frozen, y, h, sign, energy, tolerance, stages, jacobians, out)
         if tangents.shape[1] > 0:
-            _tangent_step(functions, frozen, y, h, sign, stages, tangents, scratch)
+            _tangent_step(h, sign, jacobians, tangents, scratch)
+            jacobians[0] = jacobians[6]
         y[:] = out
         gone += h
         stages[0] = stages[6]
         if crossed:
             _switch(functions, q, layout, frozen, y, polygon, facet, stages, tangents)
-            _rate(functions, frozen, y, sign, energy, stages[0])
+            _rate(functions, frozen, y, sign, energy, stages[0], jacobians[0])
         h = following
+        pace[0] = h
         if record.shape[0] > 0:
             record[rows, 0] = gone
             record[rows, 1:] = y

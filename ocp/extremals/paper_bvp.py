@@ -27,9 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 from ocp.compiled.batch import optimal_inputs, running_costs
 from ocp.compiled.jit import KERNEL, KERNEL_WITH_JACOBIAN, MATRIX, SCALAR, VECTOR, compiled, float64
 from ocp.extremals.extremal import SEGMENTS, Extremal, find_extremal
+from ocp.extremals.first_iterate import with_costates
 from ocp.extremals.hamiltonian_flow import flow_addresses, flow_layout, propagate
 from ocp.extremals.transversality import exponential_condition
-from ocp.extremals.warm_start import with_costates
 from ocp.kernels import kernels, parameters
 from ocp.pontryagin import exact_trajectory
 from ocp.query import Query
@@ -208,13 +208,14 @@ def _cost_to_goal(query: Query, trajectory: Trajectory) -> float:
     assert trajectory.costates is not None
     n = query.system.n
     z = np.concatenate([trajectory.states[k - 1], trajectory.costates[k - 1]])
-    arguments = flow_addresses(query), parameters(query), flow_layout(query)
+    arguments = flow_addresses(kernels(query)), parameters(query), flow_layout(query)
     low, high = 0.0, float(trajectory.times[k] - trajectory.times[k - 1])
+    none = np.empty((2 * n, 0))
     y = np.append(z, 0.0)
     for _ in range(60):
         middle = (low + high) / 2
         y = np.append(z, 0.0)
-        propagate(*arguments, y, np.empty((2 * n, 0)), middle, 1e-12, np.empty(0), np.empty((0, 0)))
+        propagate(*arguments, y, none, middle, 1e-12, np.zeros(1), np.empty(0), np.empty((0, 0)))
         low, high = (middle, high) if query.goal_distance(y[:n]) > 0 else (low, middle)
     return float(trajectory.cost_so_far[k - 1] + y[2 * n])
 

@@ -6,10 +6,8 @@ end: the end then lies exactly on the terminal manifold, outside the goal ball, 
 cost is smooth (in the ball the goal cost is cut off at 0), and nothing is asked of the costate at
 the start.
 
-The linear system of a Newton step is solved by carrying a basis of the terminal manifold's
-tangents backward through the segments, made orthonormal at each node (Godunov 1961): those are the
-growing solutions, so nothing is lost to their growth. At the nodes that basis [X; P] is also the
-tangent of the field of extremals: P X^-1 is the Hessian of V, and where X becomes singular lies a
+The linear system of a step is solved in newton_step.py, whose basis [X; P] of tangents at the nodes
+is that of the field of extremals: P X^-1 is the Hessian of V, and where X becomes singular lies a
 conjugate point.
 
 Steps are damped by the natural monotonicity test with simplified Newton corrections (Deuflhard,
@@ -25,11 +23,11 @@ from numpy.typing import NDArray
 
 from ocp.compiled.function_address import ADDRESSES, addresses, function_at
 from ocp.compiled.jit import KERNEL, MATRIX, VECTOR, compiled, float64
-from ocp.extremals.hamiltonian_flow import FINISHED, INTEGERS, PROPAGATE, flow_addresses
+from ocp.extremals.hamiltonian_flow import CUBE, FINISHED, INTEGERS, PROPAGATE, flow_addresses
+from ocp.extremals.newton_step import FACTOR, NEWTON_STEP, factor, newton_step
 from ocp.extremals.transversality import TERMINAL, terminal_point
+from ocp.kernels import Kernels, kernels
 from ocp.query import Query
-
-CUBE = float64[:, :, ::1]
 
 NOISE = 100.0  # a step that cannot be bettered may exceed the tolerance by this factor
 
@@ -38,16 +36,18 @@ CONVERGED, ITERATIONS, DAMPED_OUT, SINGULAR, BROKEN = 0, 1, 2, 3, 4  # how `shoo
 kernel_at = function_at(KERNEL)
 propagate_at = function_at(PROPAGATE)
 terminal_at = function_at(TERMINAL)
+factor_at = function_at(FACTOR)
+newton_step_at = function_at(NEWTON_STEP)
 
 
 def shooting_addresses(query: Query) -> NDArray[np.intp]:
     """The functions that `shoot` calls for this query."""
-    return np.concatenate([flow_addresses(query), _terminal_address()])
+    return _shooting_addresses(kernels(query))
 
 
 @cache
-def _terminal_address() -> NDArray[np.intp]:
-    return addresses([terminal_point])
+def _shooting_addresses(k: Kernels) -> NDArray[np.intp]:
+    return np.concatenate([flow_addresses(k), addresses([terminal_point, factor, newton_step])])
 
 
 @compiled(
@@ -90,6 +90,7 @@ def _defects(
     flow = kernel_at(functions[0, 0], functions[0, 1])
     y = np.zeros(2 * n + 1)
     none, no_record, no_tangents = np.empty(0), np.empty((0, 0)), np.empty((2 * n, 0))
+    pace = np.zeros(1)
     for k in range(count, 0, -1):
         share = fractions[k] - fractions[k - 1]
         y[: 2 * n] = nodes[k]
@@ -102,7 +103,7 @@ def _defects(
         else:
             tangents = no_tangents
         ended = integrate(
-            functions, q, layout, y, tangents, -share * duration, tolerance, none, no_record
+            functions, q, layout, y, tangents, -share * duration, tolerance, pace, none, no_record
         )
         if ended != FINISHED:
             return 1
@@ -118,123 +119,6 @@ def _defects(
                 gaps[0, i] = y[i] - start[i]
                 gaps[0, n + i] = 0.0
     return 0
-
-
-@compiled(types.boolean(INTEGERS, types.boolean, MATRIX, CUBE, MATRIX, CUBE, CUBE))
-def _factor(layout, free_time, edge, linear, speeds, basis, triangle):
-    """Carry the tangents of the manifold backward: `basis[k]` `[2n + 1, n]` at node k, with the
-    change of duration as last row, orthonormal; `triangle[k]` turns coordinates at node k into
-    those at node k - 1. Returns whether the basis kept its rank.
-    """
-    n = layout[0]
-    count = linear.shape[0]
-    last = basis[count]
-    last[:] = 0.0
-    for j in range(edge.shape[1]):
-        for i in range(2 * n):
-            last[i, j] = edge[i, j]
-    if free_time:
-        last[2 * n, n - 1] = 1.0
-    for k in range(count, 0, -1):
-        here, there, right = basis[k - 1], basis[k], triangle[k]
-        right[:] = 0.0
-        for c in range(n):
-            for i in range(2 * n):
-                total = speeds[k - 1, i] * there[2 * n, c]
-                for j in range(2 * n):
-                    total += linear[k - 1, i, j] * there[j, c]
-                here[i, c] = total
-            here[2 * n, c] = there[2 * n, c]
-            # Gram and Schmidt, twice
-            for _ in range(2):
-                for b in range(c):
-                    share = 0.0
-                    for i in range(2 * n + 1):
-                        share += here[i, b] * here[i, c]
-                    right[b, c] += share
-                    for i in range(2 * n + 1):
-                        here[i, c] -= share * here[i, b]
-            length = 0.0
-            for i in range(2 * n + 1):
-                length += here[i, c] ** 2
-            length = math.sqrt(length)
-            if not (1e-200 < length < 1e200):
-                return False
-            right[c, c] = length
-            for i in range(2 * n + 1):
-                here[i, c] /= length
-    return True
-
-
-@compiled(types.boolean(MATRIX, VECTOR))
-def _solve(matrix, right):
-    """Gauss with row pivoting, in place; whether the matrix is regular."""
-    n = right.shape[0]
-    for c in range(n):
-        pivot = c
-        for i in range(c + 1, n):
-            if abs(matrix[i, c]) > abs(matrix[pivot, c]):
-                pivot = i
-        if not abs(matrix[pivot, c]) > 1e-14:
-            return False
-        if pivot != c:
-            for j in range(n):
-                matrix[c, j], matrix[pivot, j] = matrix[pivot, j], matrix[c, j]
-            right[c], right[pivot] = right[pivot], right[c]
-        for i in range(c + 1, n):
-            factor = matrix[i, c] / matrix[c, c]
-            for j in range(c, n):
-                matrix[i, j] -= factor * matrix[c, j]
-            right[i] -= factor * right[c]
-    for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            right[i] -= matrix[i, j] * right[j]
-        right[i] /= matrix[i, i]
-    return True
-
-
-@compiled(types.boolean(INTEGERS, MATRIX, CUBE, MATRIX, CUBE, CUBE, VECTOR, MATRIX))
-def _newton_step(layout, gaps, linear, speeds, basis, triangle, ends, step):
-    """The Newton step for `gaps`: `step[k]` `[2n + 1]`, the change of z_k and of T, and `ends`
-    `[n]`, that of the manifold's coordinates (and T). Returns whether the system is regular.
-    """
-    n = layout[0]
-    count = linear.shape[0]
-    shift = np.empty((count, n))
-    step[count] = 0.0
-    for k in range(count, 0, -1):  # a particular solution, kept orthogonal to the basis
-        here, there, frame = step[k - 1], step[k], basis[k - 1]
-        for i in range(2 * n):
-            total = gaps[k - 1, i] + speeds[k - 1, i] * there[2 * n]
-            for j in range(2 * n):
-                total += linear[k - 1, i, j] * there[j]
-            here[i] = total
-        here[2 * n] = there[2 * n]
-        for c in range(n):
-            share = 0.0
-            for i in range(2 * n + 1):
-                share += frame[i, c] * here[i]
-            shift[k - 1, c] = share
-        for c in range(n):
-            for i in range(2 * n + 1):
-                here[i] -= shift[k - 1, c] * frame[i, c]
-    matrix = basis[0, :n].copy()
-    for i in range(n):
-        ends[i] = -step[0, i]
-    if not _solve(matrix, ends):
-        return False
-    for k in range(count + 1):
-        if k > 0:
-            for i in range(n):
-                ends[i] -= shift[k - 1, i]
-            for i in range(n - 1, -1, -1):
-                for j in range(i + 1, n):
-                    ends[i] -= triangle[k, i, j] * ends[j]
-                ends[i] /= triangle[k, i, i]
-        for c in range(n):
-            for i in range(2 * n + 1):
-                step[k, i] += basis[k, i, c] * ends[c]
-    return True
 
 
 @compiled(float64(MATRIX, float64, MATRIX, VECTOR))
@@ -313,6 +197,8 @@ def shoot(
             scale[i] += abs(nodes[k, i]) / count
     scale[2 * n] += duration
     on_manifold = terminal_at(functions[4, 0], functions[4, 1])
+    factorised = factor_at(functions[5, 0], functions[5, 1])
+    stepped = newton_step_at(functions[6, 0], functions[6, 1])
     damping, previous, previous_simplified = 1.0, 0.0, 0.0
     size, settled = np.inf, False
     for iteration in range(int(settings[2])):
@@ -322,9 +208,9 @@ def shoot(
             edge, gaps, linear, speeds, True,
         ):  # fmt: skip
             return BROKEN, iteration, duration, size
-        if not _factor(layout, free_time, edge, linear, speeds, basis, triangle):
+        if not factorised(layout, free_time, edge, linear, speeds, basis, triangle):
             return SINGULAR, iteration, duration, size
-        if not _newton_step(layout, gaps, linear, speeds, basis, triangle, ends, step):
+        if not stepped(layout, gaps, linear, speeds, basis, triangle, ends, step):
             return SINGULAR, iteration, duration, size
         size = _distance(step, 0.0, step, scale)
         if not size < np.inf:
@@ -360,7 +246,7 @@ def shoot(
                 kind, functions, q, layout, terms, start, fractions, trial, trial_end,
                 duration + change, fine, trial_edge, trial_gaps, linear, speeds, False,
             )  # fmt: skip
-            if failed or not _newton_step(
+            if failed or not stepped(
                 layout, trial_gaps, linear, speeds, basis, triangle, trial_ends, simplified
             ):
                 damping *= 0.25
@@ -386,38 +272,3 @@ def shoot(
         duration += change
         previous, previous_simplified = size, correction
     return ITERATIONS, int(settings[2]), duration, size
-
-
-@compiled(float64(ADDRESSES, VECTOR, INTEGERS, VECTOR, MATRIX, float64, int64, float64, MATRIX))
-def trace(functions, q, layout, fractions, nodes, duration, samples, tolerance, points):
-    """Integrate an extremal again, forward from each node, which the solve did not do.
-
-    Fills `points` `[N s + 1, 2n + 1]` with (z, cost so far) at `s` equal steps of each of the N
-    segments. The cost is exact to second order in the gaps that are left at the nodes.
-
-    Returns the largest distance from a node so reached to the solution's, relative to 1 + size;
-    infinite if the integration failed.
-    """
-    n = layout[0]
-    count = fractions.shape[0] - 1
-    integrate = propagate_at(functions[3, 0], functions[3, 1])
-    none, no_record, no_tangents = np.empty(0), np.empty((0, 0)), np.empty((2 * n, 0))
-    y = np.zeros(2 * n + 1)
-    worst = 0.0
-    for k in range(count):
-        y[: 2 * n] = nodes[k]
-        step = (fractions[k + 1] - fractions[k]) * duration / samples
-        for s in range(samples):
-            points[k * samples + s] = y
-            ended = integrate(
-                functions, q, layout, y, no_tangents, step, tolerance, none, no_record
-            )
-            if ended != FINISHED:
-                return np.inf
-        for i in range(2 * n):
-            worst = max(worst, abs(y[i] - nodes[k + 1, i]) / (1.0 + abs(y[i])))
-        for i in range(n):  # where the next segment begins elsewhere, the difference is worth p
-            y[2 * n] += nodes[k + 1, n + i] * (y[i] - nodes[k + 1, i])
-    points[count * samples, : 2 * n] = nodes[count]
-    points[count * samples, 2 * n] = y[2 * n]
-    return worst

@@ -5,19 +5,17 @@ adjoint equation p' = -dH/dx along it, backward from p = 0.
 """
 
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache
 
-import casadi as ca
 import numpy as np
 from numba import types
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.compiled.batch import running_costs, state_costs
-from ocp.compiled.function_address import ADDRESSES, address, addresses, function_at
+from ocp.compiled.function_address import ADDRESSES, addresses, function_at
 from ocp.compiled.jit import KERNEL, KERNEL_WITH_JACOBIAN, MATRIX, VECTOR, compiled
-from ocp.kernels import Kernels, kernels, parameters
+from ocp.kernels import Kernels, kernels
 from ocp.query import Query
-from ocp.system import System
 from ocp.trajectory import Status, Trajectory
 from ocp.value import GreedyPolicy, Policy, Value
 
@@ -31,29 +29,6 @@ kernel_at = function_at(KERNEL)
 derivatives_at = function_at(KERNEL_WITH_JACOBIAN)
 
 
-def with_costates(query: Query, guess: Trajectory) -> Trajectory:
-    """`guess`, with costates from the adjoint equation if it has none."""
-    if guess.costates is not None:
-        return guess
-    middles = (guess.states[1:] + guess.states[:-1]) / 2
-    # Inputs of a guess may jump: the later node's belong to the interval (see `guess.py`).
-    jacobians = _state_jacobians(query.system, middles, guess.inputs[1:])
-    slopes = np.empty_like(middles)
-    _cost_gradients(
-        address(kernels(query).state_cost_derivatives), middles, parameters(query), slopes
-    )
-    # The implicit midpoint rule, which stays bounded on long intervals.
-    lengths = np.diff(guess.times)[:, None]
-    pull = lengths[..., None] / 2 * jacobians.transpose(0, 2, 1)
-    identity = np.eye(query.system.n)
-    right = np.concatenate([identity + pull, (lengths * slopes)[..., None]], axis=2)
-    steps = np.linalg.solve(identity - pull, right)
-    costates = np.zeros_like(guess.states)
-    for k in range(len(middles) - 1, -1, -1):
-        costates[k] = steps[k, :, :-1] @ costates[k + 1] + steps[k, :, -1]
-    return replace(guess, costates=costates)
-
-
 def until_goal(query: Query, guess: Trajectory) -> Trajectory:
     """`guess` up to its first hit of the goal ball; all of it if there is none."""
     distance = query.goal_distance(guess.states)
@@ -62,8 +37,20 @@ def until_goal(query: Query, guess: Trajectory) -> Trajectory:
         return guess
     k = int(inside[0])
     part = distance[k - 1] / (distance[k - 1] - distance[k])
-    times = np.append(guess.times[:k], guess.times[k - 1] + part * np.diff(guess.times)[k - 1])
-    return resampled(guess, times)
+
+    def cut(columns: Array) -> Array:
+        return np.concatenate(
+            [columns[:k], [columns[k - 1] + part * (columns[k] - columns[k - 1])]]
+        )
+
+    return replace(
+        guess,
+        times=cut(guess.times),
+        states=cut(guess.states),
+        inputs=cut(guess.inputs),
+        costates=None if guess.costates is None else cut(guess.costates),
+        cost_so_far=cut(guess.cost_so_far),
+    )
 
 
 def onward(guess: Trajectory, time: float) -> Trajectory:
@@ -192,25 +179,3 @@ def _midpoint(functions, states, inputs, durations, out):
         dynamics(half, u, rate)
         for i in range(n):
             out[row, i] = x[i] + h * rate[i]
-
-
-@lru_cache
-def _state_jacobian(system: System) -> ca.Function:
-    u = ca.SX.sym("u", system.m)  # pyright: ignore[reportArgumentType]
-    rate = system.drift + system.input_matrix @ u
-    return ca.Function("A", [system.state, u], [ca.densify(ca.jacobian(rate, system.state).T)])
-
-
-def _state_jacobians(system: System, states: Array, inputs: Array) -> Array:
-    """d(f + G u)/dx `[k, n, n]` at states `[k, n]` and inputs `[k, m]`."""
-    stacked = np.array(_state_jacobian(system).map(len(states))(states.T, inputs.T))
-    return stacked.reshape(system.n, len(states), system.n).transpose(1, 2, 0)
-
-
-@compiled(types.void(ADDRESSES, MATRIX, VECTOR, MATRIX))
-def _cost_gradients(where, states, q, out):
-    derivatives = derivatives_at(where[0, 0], where[0, 1])
-    n = states.shape[1]
-    hessian = np.empty((n, n))
-    for i in range(states.shape[0]):
-        derivatives(states[i], q, out[i], hessian)

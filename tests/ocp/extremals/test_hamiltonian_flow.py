@@ -36,8 +36,8 @@ def carry(
     y = np.append(z, 0.0)
     matrix = np.ascontiguousarray(np.eye(len(z))[:, :tangents])
     ended = propagate(
-        flow_addresses(query), parameters(query), flow_layout(query), y, matrix, duration,
-        tolerance, NONE, NO_RECORD,
+        flow_addresses(kernels(query)), parameters(query), flow_layout(query), y, matrix, duration,
+        tolerance, np.zeros(1), NONE, NO_RECORD,
     )  # fmt: skip
     assert ended == FINISHED
     return y, matrix
@@ -129,14 +129,14 @@ def test_every_robot_conserves_its_hamiltonian(model: str, bounded: bool) -> Non
 
 def test_limits_and_record_end_the_motion() -> None:
     query, z, duration = SMOOTH
-    arguments = flow_addresses(query), parameters(query), flow_layout(query)
+    arguments = flow_addresses(kernels(query)), parameters(query), flow_layout(query)
     whole = carry(query, z, duration)[0]
     free = np.full(3, np.inf)
 
     y, record = np.append(z, 0.0), np.full((50, 8), np.nan)
     limits = np.concatenate([[whole[-1] / 2], -free, free])
     nothing = np.empty((6, 0))
-    assert propagate(*arguments, y, nothing, duration, 1e-12, limits, record) == LEFT
+    assert propagate(*arguments, y, nothing, duration, 1e-12, np.zeros(1), limits, record) == LEFT
     rows = int(np.isfinite(record[:, 0]).sum())
     costs = record[:rows, -1]
     assert costs[-2] <= limits[0] < costs[-1] == y[-1]
@@ -144,11 +144,11 @@ def test_limits_and_record_end_the_motion() -> None:
 
     y = np.append(z, 0.0)
     box = np.concatenate([[np.inf], -free, [0.3], free[:2]])
-    assert propagate(*arguments, y, nothing, duration, 1e-12, box, NO_RECORD) == LEFT
+    assert propagate(*arguments, y, nothing, duration, 1e-12, np.zeros(1), box, NO_RECORD) == LEFT
     assert y[0] > 0.3
 
     y, short = np.append(z, 0.0), np.full((3, 8), np.nan)
-    assert propagate(*arguments, y, nothing, duration, 1e-12, NONE, short) == LEFT
+    assert propagate(*arguments, y, nothing, duration, 1e-12, np.zeros(1), NONE, short) == LEFT
     assert np.isfinite(short).all()
 
 
@@ -156,5 +156,29 @@ def test_numbers_that_are_not_finite_fail() -> None:
     query, z, duration = SMOOTH
     y = np.append(z, 0.0)
     y[3] = np.nan
-    arguments = flow_addresses(query), parameters(query), flow_layout(query)
-    assert propagate(*arguments, y, np.empty((6, 0)), duration, 1e-9, NONE, NO_RECORD) == FAILED
+    arguments = flow_addresses(kernels(query)), parameters(query), flow_layout(query)
+    assert (
+        propagate(*arguments, y, np.empty((6, 0)), duration, 1e-9, np.zeros(1), NONE, NO_RECORD)
+        == FAILED
+    )
+
+
+def test_a_motion_in_pieces_that_keeps_its_pace_takes_fewer_steps_to_the_same_end() -> None:
+    query, z, duration = SMOOTH
+    arguments = flow_addresses(kernels(query)), parameters(query), flow_layout(query)
+    whole = carry(query, z, duration)[0]
+    steps = []
+    for kept in (True, False):
+        y, pace, count = np.append(z, 0.0), np.zeros(1), 0
+        for _ in range(8):
+            record = np.full((200, 8), np.nan)
+            if not kept:
+                pace[0] = 0.0
+            ended = propagate(
+                *arguments, y, np.empty((6, 0)), duration / 8, 1e-10, pace, NONE, record
+            )
+            assert ended == FINISHED
+            count += int(np.isfinite(record[:, 0]).sum())
+        assert_allclose(y, whole, atol=1e-8)
+        steps.append(count)
+    assert steps[0] < steps[1]
