@@ -27,16 +27,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
+from ocp.threads import THREAD_LIMITS
 from ocp.version import code_version
 
-THREAD_LIMITS = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-    "DRAKE_NUM_THREADS",
-)
-"""Set to 1 in workers before anything is imported: one task a core, not one a core squared."""
 DEATHS = 2  # workers that a task may kill, alone, before it is given up
 REOPENINGS = 5  # of a door in a row without a single answer
 START_SECONDS = 120.0  # for workers to start and import
@@ -415,7 +408,7 @@ def _everyone_is_here(workers: int) -> None:
 
 @contextmanager
 def _limited_threads() -> Iterator[None]:
-    """Workers inherit the environment of the moment they start."""
+    """One task a core, not one a core squared: workers inherit the environment as they start."""
     before = {name: os.environ.get(name) for name in THREAD_LIMITS}
     os.environ.update(dict.fromkeys(THREAD_LIMITS, "1"))
     try:

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from ocp.threads import one_thread_by_default
 from sims.benchmarks import BENCHMARKS
 from sims.exit_status import BAD_INPUT, BadInputError, reading_input
 
@@ -242,6 +243,7 @@ Command = (
 
 def main() -> None:
     """Parse the command line, run the command, exit with its status."""
+    one_thread_by_default()
     command = tyro.cli(
         Command,  # pyright: ignore[reportArgumentType]
         prog="zermelo",

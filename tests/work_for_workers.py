@@ -18,7 +18,7 @@ def refuse_seven(x: int) -> int:
 
 
 def limits(_task: Any) -> dict[str, str | None]:
-    from ocp.execution import THREAD_LIMITS
+    from ocp.threads import THREAD_LIMITS
 
     return {name: os.environ.get(name) for name in THREAD_LIMITS}
 

@@ -13,7 +13,8 @@ import pytest
 import work_for_workers as work
 from dask_cluster import DaskCluster
 
-from ocp.execution import THREAD_LIMITS, Cluster, Door, InProcess, completed, open_door
+from ocp.execution import Cluster, Door, InProcess, completed, open_door
+from ocp.threads import THREAD_LIMITS
 from ocp.trajectory import SolveError, Status
 
 TESTS = Path(__file__).resolve().parents[1]
