@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ocp.models.car import car
 from ocp.models.linear import double_integrator, rover, single_integrator, springless_rover
+from ocp.models.moving_frame import car_in_lane
 from ocp.models.robots import ROBOTS, robot_file
 from ocp.models.unicycle import unicycle
 from ocp.system import System
@@ -28,6 +29,7 @@ MODELS: dict[str, Callable[[], System]] = {
     "rover": rover,
     "springless-rover": springless_rover,
     "car": car,
+    "car_in_lane": car_in_lane,
     **{name: (lambda name=name: _from_file(robot_file(name))) for name in ROBOTS},
 }
 

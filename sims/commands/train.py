@@ -17,10 +17,12 @@ notes = Console(stderr=True)
 
 SHIPPED = ("paper", "general")
 PRELOAD = ("learning.conditioned.value_samples",)
+EXACT_PRELOAD = ("learning.causality_free.training",)
 
 
 def run(command: "cli.Train") -> int:
     """Run the command; returns its exit status."""
+    from learning.causality_free import training as causality_free
     from learning.conditioned import training
     from learning.faithful import config as faithful
     from learning.shipped import CONFIGS
@@ -37,8 +39,11 @@ def run(command: "cli.Train") -> int:
                 settings.append(faithful.Config.load(path))
             elif kind == trpo.KIND:
                 settings.append(trpo.TrpoSettings.load(path))
+            elif kind == causality_free.KIND:
+                settings.append(causality_free.TrainingSettings.load(path))
             else:
-                known = f"{training.KIND}, {faithful.KIND}, {trpo.KIND}"
+                kinds_known = (training.KIND, faithful.KIND, trpo.KIND, causality_free.KIND)
+                known = ", ".join(kinds_known)
                 raise ValueError(f"{path}: kind: {kind!r} is unknown; known are {known}")
     document = []
     for path, one in zip(paths, settings, strict=True):
@@ -53,10 +58,17 @@ def run(command: "cli.Train") -> int:
 
 
 def _train(settings: Any, path: Path, folder: Path, command: "cli.Train") -> dict[str, Any]:
+    from learning.causality_free.training import TrainingSettings as CausalityFreeSettings
     from learning.conditioned.training import TrainingSettings
     from learning.trpo.policy import TrpoSettings
 
-    if isinstance(settings, TrainingSettings):
+    if isinstance(settings, CausalityFreeSettings):
+        from learning.causality_free.run import run as train_causality_free
+
+        how = f"zermelo train {path.parent.name}/{path.name}"
+        with reading_input(), open_door(command.workers, command.cluster, EXACT_PRELOAD) as door:
+            weights = train_causality_free(settings, folder, door, how)
+    elif isinstance(settings, TrainingSettings):
         from learning.conditioned.training_run import run as train
 
         how = f"zermelo train {path.parent.name}/{path.name}"

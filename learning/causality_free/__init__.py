@@ -1,0 +1,1 @@
+"""Meta value learning without any grid: exact trajectories, residuals, a regulator inside."""
