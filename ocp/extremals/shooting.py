@@ -188,6 +188,7 @@ def shoot(
     edge, trial_edge = np.empty((2 * n, free)), np.empty((2 * n, free))
     gaps, linear = np.empty((count, 2 * n)), np.empty((count, 2 * n, 2 * n))
     speeds, triangle = np.empty((count, 2 * n)), np.empty((count + 1, n, n))
+    trial_linear, trial_speeds = np.empty_like(linear), np.empty_like(speeds)
     step, simplified = np.empty((count + 1, 2 * n + 1)), np.empty((count + 1, 2 * n + 1))
     ends, trial_ends = np.empty(n), np.empty(n)
     trial, trial_end, trial_gaps = nodes.copy(), end.copy(), gaps.copy()
@@ -200,10 +201,10 @@ def shoot(
     factorised = factor_at(functions[5, 0], functions[5, 1])
     stepped = newton_step_at(functions[6, 0], functions[6, 1])
     damping, previous, previous_simplified = 1.0, 0.0, 0.0
-    size, settled = np.inf, False
+    rough = max(settings[1], 1e-6)
+    size, settled, linearised, fine = np.inf, False, False, rough
     for iteration in range(int(settings[2])):
-        fine = settings[1] if size < 1e-2 else max(settings[1], 1e-6)
-        if _defects(
+        if not linearised and _defects(
             kind, functions, q, layout, terms, start, fractions, nodes, end, duration, fine,
             edge, gaps, linear, speeds, True,
         ):  # fmt: skip
@@ -230,6 +231,7 @@ def shoot(
                 damping = min(1.0, damping * previous * previous_simplified / (error * size))
             damping = 1.0 if size <= NOISE * settings[0] else max(damping, 10.0 * settings[3])
         tried = False
+        finer = settings[1] if size < 1e-2 else rough  # in the next iteration
         while True:
             if damping < settings[3]:
                 return DAMPED_OUT, iteration, duration, size
@@ -242,9 +244,12 @@ def shoot(
                 tried = True
                 continue
             _move(nodes, end, step, edge, ends, damping, trial, trial_end)
+            # A first trial is mostly the next iterate, so it is linearised there at once.
+            linearised = not tried and finer == fine
             failed = _defects(
                 kind, functions, q, layout, terms, start, fractions, trial, trial_end,
-                duration + change, fine, trial_edge, trial_gaps, linear, speeds, False,
+                duration + change, fine, trial_edge, trial_gaps, trial_linear, trial_speeds,
+                linearised,
             )  # fmt: skip
             if failed or not stepped(
                 layout, trial_gaps, linear, speeds, basis, triangle, trial_ends, simplified
@@ -270,5 +275,11 @@ def shoot(
         nodes[:] = trial
         end[:] = trial_end
         duration += change
+        fine = finer
+        if linearised:
+            linear, trial_linear = trial_linear, linear
+            speeds, trial_speeds = trial_speeds, speeds
+            gaps, trial_gaps = trial_gaps, gaps
+            edge, trial_edge = trial_edge, edge
         previous, previous_simplified = size, correction
     return ITERATIONS, int(settings[2]), duration, size

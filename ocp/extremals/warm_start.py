@@ -90,12 +90,38 @@ def rollouts(query: Query, policy: Policy, starts: ArrayLike) -> list[Trajectory
 
     Where time is free they are steps of constant length, at the best speed; else of constant time.
     """
+    from ocp.grids.lookahead import LookaheadPolicy
+
     system = query.system
     states = np.array(np.atleast_2d(np.asarray(starts, dtype=float)))
     stride = STRIDE * (system.upper - system.lower)[list(system.position)].max()
-    path, moves = [states], []
-    distances = [query.goal_distance(states)]
-    for _ in range(MAX_STEPS):
+    if isinstance(policy, LookaheadPolicy) and policy.query == query and not query.is_regulation:
+        goal = np.append(query.goal_position, query.goal.radius)
+        step = stride if query.is_time_free else PERIOD
+        path, inputs, durations, lengths = policy.motions(goal, states, step, MAX_STEPS)
+    else:
+        path, inputs, durations, lengths = _stepped(query, policy, states, stride)
+    found: list[Trajectory | None] = []
+    for row, count in enumerate(lengths):
+        if count < 1:
+            found.append(None)
+            continue
+        motion, seconds = path[row, : count + 1].copy(), durations[row, :count].copy()
+        outside, inside = query.goal_distance(motion[-2:])
+        part = outside / (outside - inside)
+        motion[-1] = motion[-2] + part * (motion[-1] - motion[-2])
+        seconds[-1] *= part
+        found.append(timed(query, motion, seconds, inputs[row, :count].copy()))
+    return found
+
+
+def _stepped(
+    query: Query, policy: Policy, states: Array, stride: float
+) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """As `LookaheadPolicy.motions`, for any policy."""
+    path, moves, times = [states], [], []
+    lengths = np.where(query.goal_distance(states) <= 0, 0, -1)
+    for k in range(1, MAX_STEPS + 1):
         inputs = policy(states)
         if query.is_time_free:
             effort = np.sqrt((query.input_weights * inputs**2).sum(axis=-1))
@@ -104,26 +130,12 @@ def rollouts(query: Query, policy: Policy, starts: ArrayLike) -> list[Trajectory
             durations = np.full(len(states), PERIOD)
         states = advanced(query, states, inputs, durations)
         path.append(states)
-        moves.append((durations, inputs))
-        distances.append(query.goal_distance(states))
-        if (np.min(distances, axis=0) <= 0).all():
+        moves.append(inputs)
+        times.append(durations)
+        lengths[(lengths < 0) & (query.goal_distance(states) <= 0)] = k
+        if (lengths >= 0).all():
             break
-    found: list[Trajectory | None] = []
-    for row in range(states.shape[0]):
-        signed = np.array([d[row] for d in distances])
-        inside = np.flatnonzero(signed <= 0)
-        if len(inside) == 0 or inside[0] == 0:
-            found.append(None)
-            continue
-        count = int(inside[0])
-        motion = np.array([p[row] for p in path[: count + 1]])
-        durations = np.array([m[0][row] for m in moves[:count]])
-        inputs = np.array([m[1][row] for m in moves[:count]])
-        part = signed[count - 1] / (signed[count - 1] - signed[count])
-        motion[count] = motion[count - 1] + part * (motion[count] - motion[count - 1])
-        durations[count - 1] *= part
-        found.append(timed(query, motion, durations, inputs))
-    return found
+    return np.stack(path, axis=1), np.stack(moves, axis=1), np.stack(times, axis=1), lengths
 
 
 def timed(query: Query, states: Array, durations: Array, inputs: Array) -> Trajectory:

@@ -5,6 +5,8 @@ until it enters the goal ball (first hit). Shared by the lookahead policy and by
 """
 
 import math
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numba import types
@@ -22,7 +24,7 @@ from ocp.grids.hard_obstacles import (
     interpolate_visible,
 )
 from ocp.grids.input_samples import sampled_inputs
-from ocp.kernels import kernels
+from ocp.kernels import Kernels, kernels
 from ocp.query import Query
 
 # The type of `bellman`
@@ -57,9 +59,12 @@ def bellman_addresses(query: Query, for_scheme: bool = False) -> NDArray[np.intp
     Beside hard obstacles a scheme, whose values feed on each other, mixes values by
     `interpolate_joined`, and a policy by `interpolate_visible`.
     """
-    k = kernels(query)
     beside = interpolate_joined if for_scheme else interpolate_visible
-    mixing = beside if query.hard_obstacles else interpolate
+    return _addresses(kernels(query), beside if query.hard_obstacles else interpolate)
+
+
+@cache
+def _addresses(k: Kernels, mixing: Any) -> NDArray[np.intp]:
     return addresses(
         [k.dynamics, k.state_cost, mixing, clear_segment, bellman, k.optimal_input, feedback]
     )

@@ -14,7 +14,7 @@ from numba import types
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.compiled.function_address import ADDRESSES, function_at
-from ocp.compiled.jit import MATRIX, SCALAR, VECTOR, compiled
+from ocp.compiled.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled, float64
 from ocp.compiled.parameters import parameters
 from ocp.grid import GridValue
 from ocp.grids.bellman import (
@@ -30,6 +30,9 @@ from ocp.query import Query
 CELLS = 1.0  # length of the lookahead; between 0.7 and 1.5 the closed loop's cost hardly changes
 ROUNDS = 3  # of refinement
 
+CUBE = float64[:, :, ::1]
+
+kernel_at = function_at(KERNEL)
 scalar_at = function_at(SCALAR)
 
 
@@ -65,13 +68,43 @@ class LookaheadPolicy:
             raise ValueError(f"states: expected [..., {system.n}], got shape {states.shape}")
         if not np.isfinite(states).all():
             raise ValueError("states: numbers must be finite")
-        rows = states.reshape(-1, system.n)
+        rows = np.require(states.reshape(-1, system.n), requirements=["C", "W"])
+        inputs = np.empty((len(rows), system.m))
+        _lookahead(rows, *self._arguments, self.value.flat, self._geometry, self._box, inputs)
+        return inputs.reshape(*states.shape[:-1], system.m)
+
+    def motions(
+        self, goal: NDArray[np.float64], starts: NDArray[np.float64], step: float, most: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Rough closed loops into a ball of positions, all in one compiled call.
+
+        Args:
+            goal: the ball's centre and radius, `[d + 1]`.
+            starts: `[k, n]`.
+            step: length of a midpoint step; where time is free in the R-norm, else in seconds.
+            most: number of steps after which a motion ends.
+
+        Returns:
+            States `[k, most + 1, n]`, inputs `[k, most, m]` and durations `[k, most]` of the steps
+            between them, and the number of steps `[k]` to the first state in the ball; -1 where
+            there is none (numbers behind it, or of such a motion, are not set).
+        """
+        count, (n, m) = len(starts), (self.query.system.n, self.query.system.m)
+        path, inputs = np.empty((count, most + 1, n)), np.empty((count, most, m))
+        durations, lengths = np.empty((count, most)), np.empty(count, dtype=np.int64)
+        path[:, 0] = starts
+        _drive(
+            goal, step, *self._arguments, self.value.flat, self._geometry, self._box,
+            path, inputs, durations, lengths,
+        )  # fmt: skip
+        return path, inputs, durations, lengths
+
+    @cached_property
+    def _box(self) -> NDArray[np.float64]:
+        """Lower and upper bounds `[2, n]` that states are taken into, infinite where periodic."""
         grid = self.value.grid
         free = ~np.array(grid.periodic)
-        rows = np.where(free, np.clip(rows, grid.lower, grid.upper), rows)
-        inputs = np.empty((len(rows), system.m))
-        _lookahead(rows, *self._arguments, self.value.flat, self._geometry, inputs)
-        return inputs.reshape(*states.shape[:-1], system.m)
+        return np.array([np.where(free, grid.lower, -np.inf), np.where(free, grid.upper, np.inf)])
 
     @cached_property
     def _arguments(self):
@@ -87,27 +120,92 @@ class LookaheadPolicy:
 
 @compiled(
     types.void(
-        MATRIX, MATRIX, VECTOR, types.int64, ADDRESSES, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX
+        VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, types.int64, ADDRESSES, VECTOR, VECTOR, VECTOR,
+        VECTOR, MATRIX, MATRIX,
     )
-)
-def _lookahead(
-    states, candidates, spread, rounds, functions, q, settings, values, geometry, inputs
+)  # fmt: skip
+def _input(
+    x, u, scratch, candidates, spread, rounds, functions, q, settings, values, geometry, box, room
 ):
-    n, m, d = states.shape[1], inputs.shape[1], settings.shape[0] - 4
-    state_cost = scalar_at(functions[1, 0], functions[1, 1])
+    """The policy's input `u` `[m]` at `x` `[n]`; `room` `[1, n]` is overwritten."""
+    inside = room[0]
+    squared = 0.0
+    for i in range(x.shape[0]):
+        inside[i] = min(max(x[i], box[0, i]), box[1, i])
+    for i in range(settings.shape[0] - 4):
+        squared += (inside[i] - settings[4 + i]) ** 2
+    u[:] = np.nan
+    if squared <= settings[3] ** 2:
+        u[:] = 0.0
+        return
     feedback = bellman_at(functions[6, 0], functions[6, 1])
-    scratch = np.empty((SCRATCH_ROWS, max(2 * n, m)))
+    feedback(
+        inside, u, candidates, spread, rounds, functions, q, settings, values, geometry, scratch
+    )
+    if settings[2] > 0.0:
+        u *= np.sqrt(scalar_at(functions[1, 0], functions[1, 1])(inside, q))
+
+
+@compiled(
+    types.void(
+        MATRIX, MATRIX, VECTOR, types.int64, ADDRESSES, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX,
+        MATRIX,
+    )
+)  # fmt: skip
+def _lookahead(
+    states, candidates, spread, rounds, functions, q, settings, values, geometry, box, inputs
+):
+    n, m = states.shape[1], inputs.shape[1]
+    scratch, room = np.empty((SCRATCH_ROWS, max(2 * n, m))), np.empty((1, n))
     for row in range(states.shape[0]):
-        x, u = states[row], inputs[row]
-        squared = 0.0
-        for i in range(d):
-            squared += (x[i] - settings[4 + i]) ** 2
-        u[:] = np.nan
-        if squared <= settings[3] ** 2:
-            u[:] = 0.0
-            continue
-        feedback(
-            x, u, candidates, spread, rounds, functions, q, settings, values, geometry, scratch
-        )
-        if settings[2] > 0.0:
-            u *= np.sqrt(state_cost(x, q))
+        _input(
+            states[row], inputs[row], scratch, candidates, spread, rounds, functions, q, settings,
+            values, geometry, box, room,
+        )  # fmt: skip
+
+
+@compiled(
+    types.void(
+        VECTOR, float64, MATRIX, VECTOR, types.int64, ADDRESSES, VECTOR, VECTOR, VECTOR, VECTOR,
+        MATRIX, CUBE, CUBE, MATRIX, types.int64[::1],
+    )
+)  # fmt: skip
+def _drive(
+    goal, step, candidates, spread, rounds, functions, q, settings, values, geometry, box,
+    path, inputs, durations, lengths,
+):  # fmt: skip
+    """Fills the last four but `path[:, 0]`; see `LookaheadPolicy.motions`."""
+    n, m, d = path.shape[2], inputs.shape[2], goal.shape[0] - 1
+    dynamics = kernel_at(functions[0, 0], functions[0, 1])
+    scratch, room = np.empty((SCRATCH_ROWS, max(2 * n, m))), np.empty((1, n))
+    rate, half = np.empty(n), np.empty(n)
+    for row in range(path.shape[0]):
+        lengths[row] = -1
+        for k in range(path.shape[1]):
+            x = path[row, k]
+            squared = 0.0
+            for i in range(d):
+                squared += (x[i] - goal[i]) ** 2
+            if squared <= goal[d] ** 2:
+                lengths[row] = k
+                break
+            if k == inputs.shape[1] or not squared < np.inf:
+                break
+            u = inputs[row, k]
+            _input(
+                x, u, scratch, candidates, spread, rounds, functions, q, settings, values,
+                geometry, box, room,
+            )  # fmt: skip
+            h = step
+            if settings[2] > 0.0:
+                effort = 0.0
+                for i in range(m):
+                    effort += q[i] * u[i] ** 2
+                h /= max(np.sqrt(effort), 1e-12)
+            durations[row, k] = h
+            dynamics(x, u, rate)
+            for i in range(n):
+                half[i] = x[i] + h / 2 * rate[i]
+            dynamics(half, u, rate)
+            for i in range(n):
+                path[row, k + 1, i] = x[i] + h * rate[i]
