@@ -22,7 +22,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from ocp import exact_trajectory
-from ocp.query_family import PAPER_START, paper_query
+from ocp.grid import Grid
+from ocp.query_family import PAPER_START, paper_query, sample_start
 from ocp.set_valued import Image, Method, SetValuedSettings, solve_set_valued
 from sims.closed_loop import rollout
 
@@ -76,10 +77,63 @@ for name, settings in readings.items():
 assert found["ball, 2 h"] < 0.6 * truth
 assert abs(found["lateral, h / 2"] / truth - 1) < 0.05
 
+# %% [markdown]
+# ## Does it converge?
+#
+# Values at twelve random states against exact trajectories, grid after grid: with a step at a fixed
+# ratio to the spacing h, and with one that shrinks slower than h, as the convergence theorem asks.
+# At the fixed ratio, nearest node and ball settle on a wrong limit.
+
 # %%
-figure, axes = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
-axes.barh(list(found), list(found.values()), color="#0072B2")
-axes.axvline(truth, color="#D55E00", label="exact optimum")
-axes.set(xlabel="value at the paper's start")
-axes.legend(frameon=False)
+rng = np.random.default_rng(1)
+states = [sample_start(query, rng) for _ in range(12)]
+exact = np.array([exact_trajectory(query, state).cost for state in states])
+CELLS = (29, 41, 58, 82)
+COARSEST = 10 / (CELLS[0] - 1)
+
+
+def median_error(cells: int, image: Image, alpha: float | None, power: float) -> float:
+    """Of values on one grid; `alpha` in spacings, the step proportional to spacing ** power."""
+    grid = Grid.of(query.system, (cells, cells, round(0.61 * cells)))
+    h = 10 / (cells - 1)
+    step = 2.28 * COARSEST * (h / COARSEST) ** power
+    radius = None if alpha is None else alpha * h
+    chosen = SetValuedSettings(image=image, radius=radius, step=step)
+    found = solve_set_valued(query, grid, chosen).value.value(np.array(states))
+    return float(np.median(np.abs(found / exact - 1)))
+
+
+studies = {
+    "nearest node, step ~ h": (Image.NEAREST, None, 1.0),
+    "nearest node, step ~ √h": (Image.NEAREST, None, 0.5),
+    "ball 0.87 h, step ~ h": (Image.BALL, 0.866, 1.0),
+    "ball 0.87 h, step ~ √h": (Image.BALL, 0.866, 0.5),
+    "lateral h / 2, step ~ h": (Image.LATERAL, 0.5, 1.0),
+}
+curves = {name: [median_error(cells, *study) for cells in CELLS] for name, study in studies.items()}
+print("median value error      " + "".join(f"{cells:4d} cells" for cells in CELLS))
+for name, errors in curves.items():
+    print(f"{name:24s}" + "".join(f"{error:10.1%}" for error in errors))
+assert curves["nearest node, step ~ h"][-1] > curves["nearest node, step ~ h"][0]
+assert curves["nearest node, step ~ √h"][-1] < curves["nearest node, step ~ h"][-1]
+assert curves["ball 0.87 h, step ~ √h"][-1] < 0.8 * curves["ball 0.87 h, step ~ √h"][0]
+assert curves["lateral h / 2, step ~ h"][-1] < 0.6 * curves["lateral h / 2, step ~ h"][0]
+
+# %%
+figure, axes = plt.subplots(1, 2, figsize=(11.5, 4.0), layout="constrained")
+axes[0].barh(list(found), list(found.values()), color="#0072B2")
+axes[0].axvline(truth, color="#D55E00", label=f"exact optimum {truth:.1f}")
+axes[0].set(xlabel="value at the paper's start", xlim=(0, 33), title="what alpha does")
+axes[0].legend(frameon=False, loc="lower right")
+for (name, errors), mark in zip(curves.items(), "oosso"[: len(curves)], strict=True):
+    line = "-" if name.endswith("~ h") else "--"
+    axes[1].loglog(
+        [10 / (c - 1) for c in CELLS], [100 * e for e in errors], mark + line, label=name
+    )
+axes[1].set(xlabel="spacing h (m)", ylabel="median value error (%)", title="convergence")
+axes[1].set_xticks([0.15, 0.2, 0.3], ["0.15", "0.2", "0.3"])
+axes[1].minorticks_off()
+axes[1].set_yticks([2, 5, 10, 20], ["2", "5", "10", "20"])
+axes[1].grid(alpha=0.25)
+axes[1].legend(frameon=False, fontsize=8)
 plt.show()

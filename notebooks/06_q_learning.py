@@ -55,13 +55,14 @@ for learner, result in runs.items():
         axes[0].semilogy(*np.array(known).T, label=learner)
 axes[0].axhline(1.0, color="grey", linestyle=":", label="u = 0")
 axes[0].set(xlabel="seconds of data", ylabel="gain error over the horizon")
-axes[0].legend(frameon=False)
+axes[0].set_title("while data come in")
+axes[0].legend(frameon=False, loc="center right")
 times = np.linspace(0, system.cost.horizon, 200)
 learned = runs["q-learning"].gain
 assert learned is not None
 exact = runs["q-learning"].exact.gain(times)[:, 0]
 axes[1].plot(times, exact, label=["K, position", "K, velocity"])
 axes[1].plot(times, learned(times)[:, 0], "k--", linewidth=1)
-axes[1].set(xlabel="time (s)", ylabel="gain", title="exact (colours), learned (dashed)")
+axes[1].set(xlabel="time (s)", ylabel="gain", title="Riccati (colours), learned (dashed)")
 axes[1].legend(frameon=False)
 plt.show()

@@ -39,13 +39,16 @@ def optimum() -> float:
     )[0]
 
 
-figure, axes = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
-draw_planner(axes[0], planner, colourbar=False)
 grown = planner.construction
+first = planner.route.cost / optimum() - 1
 print(f"grown     {1e3 * grown.seconds:7.1f} ms   route {planner.route.cost:.3f} m, "
-      f"{planner.route.cost / optimum() - 1:.2%} over the optimum")  # fmt: skip
+      f"{first:.2%} over the optimum")  # fmt: skip
 
 # %%
+# A figure lives in one cell; the first panel is drawn before the obstacle appears.
+figure, axes = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained")
+draw_planner(axes[0], planner, colourbar=False)
+axes[0].set_title(f"grown: {1e3 * grown.seconds:.0f} ms, {first:.2%} over the optimum")
 middle = planner.route.points[len(planner.route.points) // 2]
 planner.appear(Solid.ball([-18.0, -18.0], 0.1))  # so that the next change finds all code loaded
 update = planner.appear(Solid.ball(middle, 1.0))
@@ -56,6 +59,8 @@ print(f"repaired  {1e3 * update.seconds:7.1f} ms   route {update.route.cost:.3f}
 assert excess < 0.02
 assert update.route.certified
 draw_planner(axes[1], planner, colourbar=False)
+axes[1].set_title(f"repaired: {1e3 * update.seconds:.1f} ms, {excess:.2%} over the optimum")
+figure.colorbar(axes[1].collections[0], ax=axes, label="cost-to-go (m)", shrink=0.8)
 plt.show()
 
 # %% [markdown]
@@ -66,5 +71,12 @@ plt.show()
 (handle,) = update.handles
 planner.vanish(handle)
 planner.settle()
-print(f"restored to within {abs(planner.route.cost - grown.route.cost):.1e} m")
-assert abs(planner.route.cost - grown.route.cost) < 1e-9
+errors = {
+    "grown route, over the visibility graph's": first,
+    "repaired route, over the visibility graph's": excess,
+    "restored route, off the first one": abs(planner.route.cost / grown.route.cost - 1),
+}
+print("relative errors")
+for name, error in errors.items():
+    print(f"  {name:44s} {error:.1e}")
+assert errors["restored route, off the first one"] < 1e-10
