@@ -15,6 +15,7 @@ from learning.conditioned.network_weights import NetworkWeights
 from learning.conditioned.query_encoder import ENCODE, QueryEncoder, encode_state
 from ocp.compiled.function_address import ADDRESSES, addresses, function_at
 from ocp.compiled.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled, float64
+from ocp.compiled.kernel_call import KernelCall
 from ocp.kernels import Kernels, kernels
 from ocp.query import Query
 
@@ -105,6 +106,11 @@ class NetworkPolicy:
     @property
     def query(self) -> Query:
         return self.value.query
+
+    @property
+    def kernel_call(self) -> KernelCall:
+        """The one compiled function behind the policy."""
+        return KernelCall(_control, self.value.arguments)
 
     def __call__(self, states: ArrayLike) -> Floats:
         """Inputs `[..., 2]` at states `[..., 3]`; 0 in the goal."""

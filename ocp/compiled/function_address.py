@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 ADDRESSES = types.Array(types.intp, 2, "C")
 
+_BEHIND: dict[int, Any] = {}
+
 
 def addresses(functions: Sequence[Any]) -> NDArray[np.intp]:
     """`[k, 2]` addresses of compiled functions (C convention, numba's own), one signature each.
@@ -34,7 +36,13 @@ def addresses(functions: Sequence[Any]) -> NDArray[np.intp]:
                 library.get_pointer_to_function(names.llvm_func_name),
             ]
         )
+        _BEHIND[rows[-1][0]] = function
     return np.array(rows, dtype=np.intp)
+
+
+def function_behind(c_address: int) -> Any:
+    """The function of which `addresses` gave this first number."""
+    return _BEHIND[c_address]
 
 
 @cache

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.compiled.function_address import ADDRESSES, function_at
 from ocp.compiled.jit import KERNEL, MATRIX, SCALAR, VECTOR, compiled, float64
+from ocp.compiled.kernel_call import KernelCall
 from ocp.compiled.parameters import parameters
 from ocp.grid import GridValue
 from ocp.grids.bellman import (
@@ -105,6 +106,13 @@ class LookaheadPolicy:
         grid = self.value.grid
         free = ~np.array(grid.periodic)
         return np.array([np.where(free, grid.lower, -np.inf), np.where(free, grid.upper, np.inf)])
+
+    @property
+    def kernel_call(self) -> KernelCall:
+        """The one compiled function behind the policy."""
+        return KernelCall(
+            _lookahead, (), (*self._arguments, self.value.flat, self._geometry, self._box)
+        )
 
     @cached_property
     def _arguments(self):
