@@ -3,17 +3,19 @@
 A conditioned network answers in a millisecond. Its own closed loops are the guesses from which
 exact trajectories are found; around each a tube of neighbouring extremals steers. Grids, coarse
 ones first, replace the network as the policy off the tubes where they are known to be better, and
-tell where the network chose the wrong class of motions.
+tell where the network chose the wrong class of motions. While one step is taken, the exact
+trajectories to come are computed on the machine's other cores.
 """
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from learning.ahead import Ahead
 from learning.conditioned.compiled_network import NetworkPolicy, NetworkValue
 from learning.conditioned.pretrained_weights import Pretrained, load_pretrained
 from learning.conditioned.query_encoder import QueryEncoder
@@ -25,6 +27,7 @@ from ocp.grid import Grid
 from ocp.planning import Plan, Until, plan
 from ocp.query import Query
 from ocp.query_family import sample_start
+from ocp.threads import usable_cores
 from ocp.trajectory import SolveError, Status, Trajectory
 from ocp.value import Policy, Value
 
@@ -106,6 +109,7 @@ class MetaState:
         grid_policy: of the last grid solved.
         pending: steps to come.
         worth_nodes: of a grid as good as the network.
+        ahead: exact trajectories beside the network's loops, under way on other cores.
         trajectories: exact trajectories used.
         next_seconds: expected for the next step.
     """
@@ -118,6 +122,7 @@ class MetaState:
     base: tuple[Policy, Value]
     pending: tuple[Step, ...]
     worth_nodes: int
+    ahead: Ahead[Extremal]
     extremals: tuple[Extremal | None, ...] = ()
     nodes: int = 0
     grid_policy: Policy | None = None
@@ -142,11 +147,13 @@ class MetaPlanner:
     Attributes:
         networks: the first that knows a query is used for it.
         grids: whether to use grids at all; without, only network and exact trajectories.
+        cores: that it may occupy. The answer does not depend on how many, only its time does.
         clock: the times that steps take.
     """
 
     networks: tuple[Pretrained, ...]
     grids: bool = True
+    cores: int = field(default_factory=usable_cores)
     clock: Clock = field(default_factory=Clock)
 
     @classmethod
@@ -196,6 +203,7 @@ class MetaPlanner:
             (NetworkPolicy(network), network),
             self._steps(len(rows), chosen.worth_nodes),
             chosen.worth_nodes,
+            Ahead(partial(_beside, query, rows, loops)),
             (None,) * len(rows),
         )
         if self.grids and any(x is None for x in loops):
@@ -223,11 +231,21 @@ class MetaPlanner:
         if state.finished:
             return state
         step, *rest = state.pending
+        ready = state.ahead.ready(step.start)
         begun = time.perf_counter()
-        state = replace(state, pending=tuple(rest))
+        state = self._look_ahead(replace(state, pending=tuple(rest)), step)
         state = self._grid(state, step.nodes) if step.nodes else self._exact(state, step.start)
-        self.clock.learn(step, time.perf_counter() - begun)
+        if not ready:
+            self.clock.learn(step, time.perf_counter() - begun)
         return self._timed(state)
+
+    def _look_ahead(self, state: MetaState, step: Step) -> MetaState:
+        """Have the other cores begin the exact trajectories of `step` and of the next ones."""
+        if self.cores < 2:
+            return state
+        exact = (s.start for s in (step, *state.pending) if not s.nodes)
+        known = (i for i in exact if i < state.asked and state.loops[i] is not None)
+        return replace(state, ahead=state.ahead.begun(known, self.cores + 1))
 
     def policy(self, state: MetaState) -> Policy:
         """Tubes around the exact trajectories, the best policy known elsewhere."""
@@ -257,9 +275,11 @@ class MetaPlanner:
                 if i not in todo:
                     again.append(Step(start=i))
         better = failed or nodes > state.worth_nodes
+        ahead = state.ahead.without(i for i, loop in enumerate(loops) if loop is None)
         return replace(
             state,
             loops=tuple(loops),
+            ahead=ahead,
             base=(policy, value) if better else state.base,
             nodes=nodes if better else state.nodes,
             grid_policy=policy,
@@ -279,13 +299,18 @@ class MetaPlanner:
             )
         if query.goal_distance(state.starts[i]) <= 0:
             return state
-        loop = state.loops[i]
-        guess = loop.motion(query) if loop is not None else None
-        if guess is None and state.grid_policy is not None:
+        if state.loops[i] is not None and i < state.asked:
+            found, ahead = state.ahead.taken(i)
+            state = replace(state, ahead=ahead)
+        elif state.loops[i] is not None:
+            found = _beside(query, state.starts, state.loops, i)
+        elif state.grid_policy is not None:
             guess = rollouts(query, state.grid_policy, state.starts[i])[0]
-        if guess is None:
+            if guess is None:
+                return state
+            found = find_extremal(query, state.starts[i], guess)
+        else:
             return state
-        found = find_extremal(query, state.starts[i], guess)
         known = state.extremals[i]
         best = known if known is not None and known.cost <= found.cost else found
         extremals = list(state.extremals)
@@ -295,6 +320,13 @@ class MetaPlanner:
             extremals=tuple(extremals),
             trajectories=state.trajectories + (found.trajectory is not None),
         )
+
+
+def _beside(query: Query, starts: Floats, loops: tuple[Loop | None, ...], i: int) -> Extremal:
+    """The extremal from the i-th start beside the network's closed loop."""
+    loop = loops[i]
+    assert loop is not None  # nothing else is begun ahead
+    return find_extremal(query, starts[i], loop.motion(query))
 
 
 def _loops(network: NetworkValue, starts: Floats) -> tuple[Loop | None, ...]:

@@ -1,10 +1,12 @@
-"""How many threads the libraries underneath may start: one, unless the user says otherwise.
+"""Threads: one a library unless the user says otherwise, and a few of our own, always warm.
 
 The matrices here are small and one query occupies one core. A pool of threads a product costs more
 than it saves, and ten times more where a neighbour keeps the other core busy.
 """
 
 import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 THREAD_LIMITS = (
     "OMP_NUM_THREADS",
@@ -23,3 +25,14 @@ def one_thread_by_default() -> None:
     """
     for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
+
+
+def usable_cores() -> int:
+    """How many cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@cache
+def warm_workers() -> ThreadPoolExecutor:
+    """Threads for compiled work beside the caller's: one for each further core, at least one."""
+    return ThreadPoolExecutor(max(1, usable_cores() - 1), thread_name_prefix="zermelo")

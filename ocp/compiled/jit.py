@@ -32,6 +32,9 @@ def cache_folder() -> Path:
 def compiled(signature: Any, source_key: str | None = None) -> Callable[[Callable], Any]:
     """Decorator: compile now for `signature`, through numba's disk cache.
 
+    What is compiled releases the interpreter while it runs: it touches arrays alone, so threads may
+    run it side by side.
+
     The first compilation on a machine is announced by a log record of level INFO.
     """
 
@@ -41,7 +44,7 @@ def compiled(signature: Any, source_key: str | None = None) -> Callable[[Callabl
         marker = cache_folder() / "compiled" / f"{name}-{key}-{numba.__version__}"
         if not marker.exists():
             log.info("compiling %s (once on this machine)", name)
-        dispatcher = njit(signature, cache=True, error_model="numpy")(function)
+        dispatcher = njit(signature, cache=True, error_model="numpy", nogil=True)(function)
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.touch()
         return dispatcher

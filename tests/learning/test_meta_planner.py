@@ -1,5 +1,7 @@
 """The main method: a planner's laws, deadlines, and what the shipped weights promise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from learning.meta_planner import Clock, Step
 from learning.shipped import PRETRAINED
 from ocp import Goal, Obstacle, Query, SolveError, exact_trajectory, iterations, trajectories
 from ocp.family_file import load_family
-from ocp.query_family import PAPER_START, paper_query, sample_start
+from ocp.query_family import PAPER_FAMILY, PAPER_START, paper_query, sample_start
 from sims.closed_loop import LoopSettings, rollouts
 
 FAMILIES = ("paper", "general")
@@ -120,3 +122,19 @@ def test_shipped_weights_are_small_and_say_where_they_come_from(name):
 def test_unknown_weights_are_refused():
     with pytest.raises(ValueError, match="'mine' is unknown"):
         MetaPlanner.pretrained("mine")
+
+
+def test_how_many_cores_work_changes_the_time_alone() -> None:
+    """Trajectories computed ahead on other cores are those that one core computes in turn."""
+    rng = np.random.default_rng(7)
+    query = PAPER_FAMILY.sample(rng)
+    starts = [sample_start(query, rng) for _ in range(6)]
+    answers = []
+    for cores in (1, 2, 5):
+        planner = replace(MetaPlanner.pretrained("paper"), cores=cores)
+        answers.append(planner.plan(query, starts, trajectories(6)))
+    assert answers[0].trajectories == 6
+    for other in answers[1:]:
+        assert other.trajectories == 6
+        np.testing.assert_array_equal(other.value.value(starts), answers[0].value.value(starts))
+        np.testing.assert_array_equal(other.policy(starts), answers[0].policy(starts))
