@@ -84,7 +84,9 @@ class ConditionedNetwork(nn.Module):
         f = (obstacle - self.obstacle_mean) / self.obstacle_scale
         first = silu(self.member_obstacle(f) + self.member_state(s)[owner])
         second = silu(self.member_hidden(first))
-        total = torch.zeros(len(s), second.shape[1], dtype=second.dtype).index_add(0, owner, second)
+        # Not `len(s)`, which ties an exported network to one number of states.
+        zero = torch.zeros(s.shape[0], second.shape[1], dtype=second.dtype)
+        total = zero.index_add(0, owner, second)
         hidden = silu(self.trunk_sum(total) + self.trunk_state(s))
         return self.heads(silu(self.trunk_hidden(hidden)))
 
