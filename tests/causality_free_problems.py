@@ -31,14 +31,14 @@ def random_value(family: RegulationFamily, seed: int, size: float = 0.3) -> Netw
 
 SMALL = TrainingSettings(
     "car",
-    queries=6,
+    queries=5,
     held_out=2,
-    motions=(6, 2),
-    steps=(120, 80),
+    motions=(12, 3),
+    steps=(400, 100),
     widths=(16, 16),
     batch=128,
     rate=5e-3,
     warm_up=20,
-    checkpoint_steps=50,
+    checkpoint_steps=100,
 )
 """A training run of a few seconds."""

@@ -2,8 +2,9 @@
 
 log V = log V_LQR + w'(phi(x) - phi(x_g)) is linear in the last layer w, and so is the costate where
 V is known: one regularised linear least-squares problem, no steps and no rates. How far w may go
-from the trained one is chosen by the Hamilton-Jacobi residual at held-out states, where no motion
-is needed; staying is among the choices, so the held-out residual never gets worse.
+from the trained one is chosen by cross-validation over the motions: the policy's excess on those
+left out. What is chosen is adopted only if it lowers the Hamilton-Jacobi residual at held-out
+states too, where no motion is needed; so the held-out residual never gets worse.
 """
 
 from collections.abc import Sequence
@@ -13,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learning.causality_free.residual import residuals
-from learning.causality_free.samples import Samples
+from learning.causality_free.samples import POINTS, Samples
 from learning.causality_free.value import NetworkValue
 
 Array = NDArray[np.float64]
 
 STRENGTHS = (10.0, 1.0, 0.1, 0.01, 1e-3)
 """Of the pull towards the trained weights, relative to what the data say."""
+FOLDS = 4
+COSTATE_WEIGHT, VALUE_WEIGHT = 0.1, 1.0  # as in the training's loss
 
 
 @dataclass(frozen=True)
@@ -38,37 +41,76 @@ class Adapted:
     after: float
 
 
+@dataclass(frozen=True)
+class Equations:
+    """Linear equations in w, those of each sample together: first `m` of the policy's error.
+
+    Attributes:
+        rows: `[k, r, width]`.
+        wanted: `[k, r]`.
+        weights: `[k, r]`, of their squares.
+        inputs: m, how many of the r are of the policy.
+    """
+
+    rows: Array
+    wanted: Array
+    weights: Array
+    inputs: int
+
+    def excess(self, w: Array) -> Array:
+        """The policy's relative excess `[k]`, see `samples.py`."""
+        m = self.inputs
+        return ((self.rows[:, :m] @ w - self.wanted[:, :m]) ** 2).sum(axis=1)
+
+    def solve(self, w: Array, strengths: Sequence[float], picked: NDArray[np.bool_]) -> list[Array]:
+        """The w's that fit the picked samples, each with a pull towards the present `w`."""
+        root = np.sqrt(self.weights[picked])
+        rows = (root[..., None] * self.rows[picked]).reshape(-1, len(w))
+        gap = (root * (self.wanted[picked] - self.rows[picked] @ w)).ravel()
+        normal, right = rows.T @ rows, rows.T @ gap
+        size = float(np.trace(normal)) / len(w)
+        identity = np.eye(len(w))
+        return [w + np.linalg.solve(normal + s * size * identity, right) for s in strengths]
+
+
 def adapt(
     value: NetworkValue,
     samples: Samples,
     held_out: Array,
-    costate_weight: float = 0.1,
-    value_weight: float = 1.0,
     strengths: Sequence[float] = STRENGTHS,
 ) -> Adapted:
     """Refit the last layer to exact motions of the value's query.
 
     Args:
         value: with the trained weights.
-        samples: of exact motions.
+        samples: of exact motions, `POINTS` a motion.
         held_out: `[k, n]`, states of the guard.
-        costate_weight, value_weight: as in the training's loss.
         strengths: to choose from.
     """
-    rows, wanted = _equations(value, samples, costate_weight, value_weight)
-    w = value.weights.last.numpy()
-    gap = wanted - rows @ w
-    normal, right = rows.T @ rows, rows.T @ gap
-    size = float(np.trace(normal)) / len(w)
-    guard = [guard_score(value, held_out)]
-    candidates = [value]
-    for strength in strengths:
-        step = np.linalg.solve(normal + strength * size * np.eye(len(w)), right)
-        candidates.append(value.with_last(np.asarray(w + step, dtype=float)))
-        guard.append(guard_score(candidates[-1], held_out))
-    best = int(np.argmin(guard))
-    strength = np.inf if best == 0 else strengths[best - 1]
-    return Adapted(candidates[best], float(strength), guard[0], guard[best])
+    before = guard_score(value, held_out)
+    stay = Adapted(value, np.inf, before, before)
+    equations, w = equations_of(value, samples), value.weights.last.numpy()
+    motion = np.arange(len(samples)) // POINTS
+    errors = np.zeros(1 + len(strengths))
+    for fold in range(FOLDS):
+        left_out = motion % FOLDS == fold
+        if left_out.any() and not left_out.all():
+            fits = [w, *equations.solve(w, strengths, ~left_out)]
+            errors += [np.log1p(equations.excess(fit)[left_out]).sum() for fit in fits]
+    best = int(np.argmin(errors))  # the first of equals: staying
+    if best == 0:
+        return stay
+    strength = strengths[best - 1]
+    adapted = refit(value, samples, [strength])[0]
+    after = guard_score(adapted, held_out)
+    return Adapted(adapted, strength, before, after) if after < before else stay
+
+
+def refit(value: NetworkValue, samples: Samples, strengths: Sequence[float]) -> list[NetworkValue]:
+    """The last layer refitted to `samples`, once for each strength of the pull; no guard."""
+    equations, w = equations_of(value, samples), value.weights.last.numpy()
+    everything = np.ones(len(samples), dtype=bool)
+    return [value.with_last(fit) for fit in equations.solve(w, strengths, everything)]
 
 
 def guard_score(value: NetworkValue, states: Array) -> float:
@@ -76,10 +118,11 @@ def guard_score(value: NetworkValue, states: Array) -> float:
     return float(np.log1p(residuals(value.query, value, states)).mean())
 
 
-def _equations(
-    value: NetworkValue, samples: Samples, costate_weight: float, value_weight: float
-) -> tuple[Array, Array]:
-    """Rows `[r, width]` and right side `[r]` of the least-squares problem in w."""
+def equations_of(value: NetworkValue, samples: Samples) -> Equations:
+    """What samples say about the last layer.
+
+    The loss's logarithms weigh an outlier's equations down, as the trained w sees them.
+    """
     e, V, p, D = samples.offsets, samples.values, samples.costates, samples.sensitivity
     phi, slopes = value.last_features(value.query.reference + e)
     Pe = e @ value.P
@@ -89,10 +132,18 @@ def _equations(
     slopes = V[:, None, None] * slopes
     scaled = value.scale / np.linalg.norm(p * value.scale, axis=1, keepdims=True)
     blocks = [
-        (value_weight, phi, log_ratio),
         (1.0, np.einsum("knm,knw->kmw", D, slopes), np.einsum("knm,kn->km", D, wrong)),
-        (costate_weight, scaled[..., None] * slopes, scaled * wrong),
+        (COSTATE_WEIGHT, scaled[..., None] * slopes, scaled * wrong),
+        (VALUE_WEIGHT, phi[:, None], log_ratio[:, None]),
     ]
-    width = phi.shape[1]
-    rows = np.concatenate([np.sqrt(a) * r.reshape(-1, width) for a, r, _ in blocks])
-    return rows, np.concatenate([np.sqrt(a) * b.ravel() for a, _, b in blocks])
+    w = value.weights.last.numpy()
+    weights = []
+    for weight, rows, wanted in blocks:
+        size = 1.0 + ((rows @ w - wanted) ** 2).sum(axis=1, keepdims=True)
+        weights.append(np.broadcast_to(weight / size, wanted.shape))
+    return Equations(
+        np.concatenate([rows for _, rows, _ in blocks], axis=1),
+        np.concatenate([wanted for _, _, wanted in blocks], axis=1),
+        np.concatenate(weights, axis=1),
+        D.shape[2],
+    )

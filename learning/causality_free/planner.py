@@ -46,7 +46,7 @@ class CausalityFreeState:
         pending: `[k, n]`, starts that were asked for and are not solved yet.
         optima: the exact trajectories.
         asked: how many trajectories were tried.
-        most: how many may be.
+        most: how many are wanted; twice as many are tried at most.
         next_seconds: 0: not known.
     """
 
@@ -64,11 +64,11 @@ class CausalityFreeState:
 
     @property
     def trajectories(self) -> int:
-        return self.asked
+        return len(self.optima)
 
     @property
     def finished(self) -> bool:
-        return self.asked >= self.most
+        return len(self.optima) >= self.most or self.asked >= 2 * self.most
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ class CausalityFreePlanner:
 
     Attributes:
         network: the network; `None` takes the shipped one that knows the query.
-        most: exact trajectories in all.
+        most: exact trajectories in all. Starts that the closed loops do not solve are replaced,
+            rather than grown by continuation, which takes ten times as long.
         seed: of starts and held-out states.
     """
 
@@ -124,10 +125,10 @@ class CausalityFreePlanner:
         """A few exact trajectories more, and the last layer refitted to all of them."""
         if state.finished:
             return state
-        count = min(BATCH, state.most - state.asked)
+        count = min(BATCH, state.most - len(state.optima))
         starts = self._starts(state, count)
         values = [state.value, RegulatorValue(state.query)]
-        found = exact_trajectories(state.query, values, starts)
+        found = exact_trajectories(state.query, values, starts, continuation=False)
         optima = (*state.optima, *(optimum for optimum in found if optimum is not None))
         state = replace(
             state, optima=optima, asked=state.asked + count, pending=state.pending[count:]

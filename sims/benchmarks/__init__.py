@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 BENCHMARKS: dict[str, str] = {
     "brackets": "certified brackets of the optimal cost: how many hold, how wide they are",
+    "causality-free": "values learned from exact trajectories alone, in five and six dimensions",
     "deadlines": "how late plans are ready against their deadline, over 10,000 calls",
     "exact": "exact costs, closed form, success and time of exact trajectories",
     "execution": "speed-up of two workers, what Dask adds a task, worker deaths survived",
