@@ -136,7 +136,7 @@ class MeshPolicy:
     def _arguments(self):
         query = self.query
         candidates, spread = sampled_inputs(query)
-        functions = bellman_addresses(query)
+        functions = bellman_addresses(query).copy()  # shared by all policies of such queries
         functions[2] = addresses([interpolate_mesh])[0]
         settings = bellman_settings(query, CELLS)
         return candidates, spread, ROUNDS, functions, parameters(query), settings

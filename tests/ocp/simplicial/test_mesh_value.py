@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ocp.grid import Grid
+from ocp.grids.bellman import bellman_addresses
 from ocp.obstacle import Obstacle
 from ocp.query import Goal, Query
 from ocp.query_family import PAPER_START, paper_query
@@ -74,6 +75,13 @@ def test_a_mesh_over_the_whole_turn_gives_the_same_value() -> None:
     whole = Mesh.kuhn(Grid.of(PAPER.system, (15, 15, 10)))
     a, b = (solve_on_mesh(PAPER, m, tolerance=1e-9) for m in (half, whole))
     np.testing.assert_allclose(a.value.value(whole.vertices), b.values, rtol=1e-7)
+
+
+def test_the_policy_leaves_those_on_grids_alone() -> None:
+    """The functions of a query's policies are looked up once, for all of them."""
+    before = bellman_addresses(PAPER).copy()
+    solved(PAPER, 6_000).policy()(np.array(PAPER_START))
+    np.testing.assert_array_equal(bellman_addresses(PAPER), before)
 
 
 def test_the_policy_reaches_the_goal_and_travels_to_other_processes() -> None:
