@@ -14,6 +14,7 @@ import tyro
 
 from ocp.threads import one_thread_by_default
 from sims.benchmarks import BENCHMARKS
+from sims.demos import DEMOS
 from sims.exit_status import BAD_INPUT, BadInputError, reading_input
 
 
@@ -71,8 +72,10 @@ class Plan(Common):
 class Demo(Common):
     """Run a scripted demo, one for each capability."""
 
-    name: tyro.conf.Positional[str] = tyro.MISSING
-    """four-queries: the four queries of Xu and Zhu's Table I; replanning: RRT^X at work."""
+    name: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(help=" ".join(f"{name}: {what}." for name, what in DEMOS.items())),
+    ] = tyro.MISSING
 
     def run(self) -> int:
         from sims.demos import run

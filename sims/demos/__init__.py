@@ -16,7 +16,13 @@ if TYPE_CHECKING:
     from sims import cli
 
 DEMOS: dict[str, str] = {
+    "adaptation": "the meta planner on a fresh query: policy, value, error against the optimum",
+    "brackets": "a certified gap: a bound below every motion, a motion above it",
+    "drake-robot": "from SDF files: a cart-pole swung up, a quadrotor among obstacles, in Drake",
+    "exact-classes": "several ways round the obstacles, each an extremal; one is the optimum",
     "four-queries": "the four queries of Xu and Zhu's Table I, the exact optimum beside",
+    "navigation": "RRT-Q^X: a robot of unknown dynamics among obstacles that come into view",
+    "regulation": "Q-learning without a model against exact Riccati, the printed law beside",
     "replanning": "RRT^X repairs its route while obstacles appear, move and vanish",
     "revealed-goals": "goals arrive while the robot drives; it waits for no policy",
 }
