@@ -146,6 +146,12 @@ def _value_iteration() -> OneShot:
     return OneShot(solve)
 
 
+def _causality_free() -> Planner:
+    from learning.causality_free.planner import CausalityFreePlanner
+
+    return CausalityFreePlanner()
+
+
 def _refmm() -> Planner:
     from ocp.refmm import Refmm
 
@@ -175,6 +181,9 @@ METHODS: dict[str, Method] = {
     ),
     "value-iteration": Method(
         "to an equilibrium: value iteration on a grid, up to 4 states", _value_iteration
+    ),
+    "causality-free": Method(
+        "to an equilibrium: a network on exact trajectories, a regulator inside", _causality_free
     ),
     "set-valued": Method("the set-valued method of Xu and Zhu on its coarse grid", _set_valued),
     "refmm": Method(

@@ -1,4 +1,4 @@
-"""What the shipped networks promise, on a few fresh queries: they reach, at nearly the least cost."""
+"""What the shipped networks promise: on fresh queries they reach, at nearly the least cost."""
 
 import pytest
 

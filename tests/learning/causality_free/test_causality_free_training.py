@@ -1,6 +1,6 @@
 """Training: lowers the error against exact costs, goes on where it stopped, keeps its promises."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -9,10 +9,10 @@ from causality_free_problems import SMALL, random_weights
 
 from learning.causality_free.adaptation import adapt
 from learning.causality_free.exact import exact_trajectories
-from learning.causality_free.families import get_family
+from learning.causality_free.families import FAMILIES, get_family
 from learning.causality_free.network import Weights
 from learning.causality_free.planner import CausalityFreePlanner
-from learning.causality_free.pretrained import Pretrained
+from learning.causality_free.pretrained import Pretrained, load_pretrained, pretrained_for
 from learning.causality_free.run import run
 from learning.causality_free.samples import POINTS, Samples
 from learning.causality_free.training import (
@@ -25,6 +25,7 @@ from learning.causality_free.training import (
     start,
     train,
 )
+from learning.shipped import CONFIGS
 from ocp.execution import InProcess
 from ocp.planning import trajectories
 from ocp.query import Equilibrium
@@ -233,3 +234,20 @@ def test_gathering_is_the_same_wherever_it_is_done() -> None:
     here, through = gather_here(tasks), gather_through(InProcess())(tasks)
     for a, b in zip(here, through, strict=True):
         assert np.array_equal(a.costates, b.costates)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_shipped_weights_are_those_of_the_shipped_configuration(name) -> None:
+    settings = TrainingSettings.load(CONFIGS / f"causality-free-{name}.toml")
+    network = load_pretrained(name)
+    told = network.provenance["settings"]
+    assert TrainingSettings(**{**told, **as_tuples(told), "loss": settings.loss}) == settings
+    assert told["loss"] == asdict(settings.loss)
+    fresh = network.family.sample(np.random.default_rng(2_000_000))
+    assert network.why_unknown(fresh) is None
+    assert pretrained_for(fresh) is network
+
+
+def as_tuples(table: dict) -> dict[str, tuple]:
+    """TOML has no tuples."""
+    return {name: tuple(value) for name, value in table.items() if isinstance(value, list)}

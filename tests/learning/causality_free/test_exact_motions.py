@@ -37,9 +37,10 @@ def test_values_and_costates_solve_the_hamilton_jacobi_equation(family) -> None:
     for optimum in exact_trajectories(query, [RegulatorValue(query)], family.starts(query, 4, rng)):
         assert optimum is not None
         motion = optimum.motion
+        assert motion.costates is not None
         H = minimised_hamiltonians(query, motion.states, motion.costates)
         # H is constant, and what the linear regulator's tail leaves of it is of third order there.
-        assert np.abs(H).max() < 0.05 * TAIL * optimum.cost * 10
+        assert np.abs(H).max() < 0.5 * TAIL * optimum.cost
         assert (np.diff(optimum.values) < 0).all()
         tail = float(RegulatorValue(query).value(motion.states[-1]))
         assert optimum.values[-1] == pytest.approx(tail, rel=1e-9)
@@ -54,6 +55,7 @@ def test_a_linear_robots_motion_costs_what_riccati_says() -> None:
     for start, found in zip(starts, exact_trajectories(query, [value], starts), strict=True):
         assert found is not None
         assert found.cost == pytest.approx(float(value.value(start)), rel=1e-7)
+        assert found.motion.costates is not None
         slope = value.gradient(found.motion.states)
         assert np.allclose(found.motion.costates, slope, rtol=1e-6, atol=1e-6)
 
