@@ -149,6 +149,14 @@ class MetaPlanner:
         grids: whether to use grids at all; without, only network and exact trajectories.
         cores: that it may occupy. The answer does not depend on how many, only its time does.
         clock: the times that steps take.
+
+    Example:
+        >>> from ocp.planning import trajectories
+        >>> from ocp.query_family import PAPER_START, paper_query
+        >>> planner = MetaPlanner.pretrained("paper")
+        >>> plan = planner.plan(paper_query((4.0, 4.0)), [PAPER_START], trajectories(1))
+        >>> plan.trajectories, bool(abs(plan.value.value(PAPER_START) / 23.2998 - 1) < 1e-4)
+        (1, True)
     """
 
     networks: tuple[Pretrained, ...]

@@ -139,6 +139,14 @@ def solve_eikonal(
         SolveError: NOT_APPLICABLE if the scheme does not fit the query; NOT_CONVERGED; INFEASIBLE
             if nothing outside the goal reaches it.
         ValueError: if the grid does not fit.
+
+    Example:
+        >>> from ocp.query_family import PAPER_START, paper_query
+        >>> solution = solve_eikonal(paper_query((1.0, 4.0)))
+        >>> bool(abs(solution.value.value(PAPER_START) / 19.1125 - 1) < 0.005)  # exact: 19.1125
+        True
+        >>> solution.policy()(PAPER_START).shape
+        (2,)
     """
     if query.is_regulation:
         raise SolveError(

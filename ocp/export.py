@@ -1,6 +1,6 @@
 """Policies as dependency-free C99, for a robot's own computer.
 
-    >>> export_c(policy, "controller")          # controller/policy.c and policy.h
+    export_c(policy, "controller")          # controller/policy.c and policy.h
 
     void policy_input(const double state[n], double input[m]);
 

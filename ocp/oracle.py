@@ -130,6 +130,12 @@ def consult(query: Query, state: ArrayLike, with_grid: bool = False) -> Verdict:
 
     Raises:
         ValueError: if the state does not fit the query.
+
+    Example:
+        >>> from ocp.query_family import PAPER_START, paper_query
+        >>> verdict = consult(paper_query((1.0, 1.0)), PAPER_START)
+        >>> verdict.established, round(verdict.value, 4)
+        (True, 15.5772)
     """
     start = query.check_start(state)
     if query.is_regulation:

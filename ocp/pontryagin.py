@@ -101,6 +101,12 @@ def exact_trajectory(
     Raises:
         ValueError: if the start does not fit.
         SolveError: if no class of motions led to a verified answer.
+
+    Example:
+        >>> from ocp.query_family import PAPER_START, paper_query
+        >>> motion = exact_trajectory(paper_query((4.0, 4.0)), PAPER_START)
+        >>> round(motion.cost, 4)
+        23.2998
     """
     return exact_trajectories(query, start, guess)[0]
 

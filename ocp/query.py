@@ -101,6 +101,14 @@ class Query:
         cost: weights of the running cost.
         input_lower, input_upper: `m` bounds each, or `None` for no bound.
         robot_radius: metres; hard obstacles and collisions are judged for a ball of this radius.
+
+    Example:
+        >>> from ocp.obstacle import Obstacle
+        >>> query = Query("unicycle", Goal((1.0, 4.0), 0.5), (Obstacle.circle((-1.0, -1.0), 1.0),))
+        >>> float(query.goal_distance([1.0, 3.0, 0.0]))
+        0.5
+        >>> float(query.clearance([-1.0, 1.0, 0.0]))
+        1.0
     """
 
     model: str | ModelFile | System

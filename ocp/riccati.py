@@ -257,6 +257,11 @@ def algebraic_riccati(problem: LinearQuadratic) -> AlgebraicRiccati:
     Raises:
         ValueError: if (A, B) is not stabilisable or (A, M) not detectable; the mode is named.
         SolveError: NOT_CONVERGED if the engine's answer does not satisfy the equation.
+
+    Example:
+        >>> problem = LinearQuadratic([[0.0]], [[1.0]], [[1.0]], [[1.0]])  # x' = u, cost x^2 + u^2
+        >>> round(float(algebraic_riccati(problem).value([2.0])), 9)  # P = 1
+        4.0
     """
     import control
 

@@ -124,6 +124,15 @@ class RRTX:
     It owns the world: obstacles come and go through the planner (`change`), so that both agree.
     Every update repairs the tree until the robot's route is settled; `settle`, or
     `to_the_end=True`, repairs the rest.
+
+    Example:
+        >>> from planners.solids import Solid
+        >>> from planners.world import SceneWorld
+        >>> planner = RRTX(SceneWorld([-5, -5], [5, 5]), goal=[4, 4], robot=[-4, -4], nodes=500)
+        >>> before = planner.route.cost
+        >>> update = planner.appear(Solid.ball([0, 0], 1.0))
+        >>> update.route.certified, update.route.cost > before
+        (True, True)
     """
 
     def __init__(

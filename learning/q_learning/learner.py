@@ -85,6 +85,14 @@ class QLearner:
 
     Raises:
         ValueError: if a setting does not fit the cost's dimensions.
+
+    Example:
+        >>> cost = QuadraticCost(M=[[1.0]], R=[[1.0]], terminal=[[0.0]], horizon=10.0)
+        >>> learner, x = QLearner(cost), np.array([1.0])
+        >>> for _ in range(200):  # the plant, which it does not know: x' = u
+        ...     x = x + learner.settings.sample_period * learner.control(x)
+        >>> bool(abs(learner.learned().gain(0.0)[0, 0] - 1.0) < 1e-6)  # K = 1
+        True
     """
 
     cost: QuadraticCost
