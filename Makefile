@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test notebooks docs lint clean
+.PHONY: demo test notebooks reproduce docs lint clean
 
 .venv/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -17,6 +17,9 @@ test: .venv/installed
 
 notebooks: .venv/installed
 	$(BIN)/python -m pytest --numprocesses 2 -m notebook
+
+reproduce: .venv/installed
+	$(BIN)/zermelo reproduce all --quick --out out/reproduce
 
 docs: .venv/installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict

@@ -55,6 +55,8 @@ def run(setting: Setting, parts: Parts) -> Findings:
     curves, absent = {}, {}
     for name, (key, trace) in CURVES.items():
         why = contestant(key).absent
+        if setting.quick and name in SLOW:
+            why = "trained for minutes on each query, left out of a quick run"
         if why is not None:
             absent[name] = why
             continue
@@ -158,6 +160,7 @@ CURVES: dict[str, tuple[str, Callable]] = {
     "interpolation": ("interpolation", _refining("interpolation", 0)),
 }
 """The contestant behind each curve, and what traces it."""
+SLOW = ("interpolation",)
 SIZES = {
     "eikonal": {"nodes": list(NODES)},
     "set-valued": {"cells": list(CELLS), "ratio": RATIO},
