@@ -181,7 +181,7 @@ class MetaPlanner:
     def plan(
         self, query: Query, starts: Sequence[ArrayLike] = (), until: Until | None = None
     ) -> Plan:
-        """`ocp.plan` with this planner.
+        """`ocp.plan` with this planner, for the `starts` `[n]` that matter most.
 
         Raises:
             ValueError: if a start does not fit.
@@ -190,7 +190,7 @@ class MetaPlanner:
         return plan(self, query, starts, until)
 
     def start(self, query: Query, starts: Sequence[NDArray[np.float64]]) -> MetaState:
-        """The network's policy, checked from the starts; a coarse grid's if it fails the check.
+        """The network's policy, checked from the starts `[n]`; a coarse grid's if it fails.
 
         Raises:
             SolveError: NOT_APPLICABLE if the network cannot know such a query.

@@ -215,7 +215,7 @@ class HorizonValue:
         return np.ravel(inside) & (not self.query.is_regulation)
 
     def rows(self, states: ArrayLike) -> Array:
-        """`states` `[..., n]` as finite numbers."""
+        """`states` `[..., n]` as finite numbers; raises a ValueError if they are none."""
         rows = np.asarray(states, dtype=float)
         n = self.query.system.n
         if rows.shape[-1:] != (n,) or not np.isfinite(rows).all():

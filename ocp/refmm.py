@@ -151,7 +151,7 @@ class Refmm:
     settings: RefmmSettings = RefmmSettings()
 
     def start(self, query: Query, starts: Sequence[NDArray[np.float64]] = ()) -> RefmmState:
-        """Solve on the first mesh.
+        """Solve on the first mesh; it will be refined for the `starts` `[n]`.
 
         Raises:
             SolveError: NOT_APPLICABLE, NOT_CONVERGED or INFEASIBLE.
@@ -185,7 +185,7 @@ def solve_refmm(
 
     Args:
         query: time-free; up to 3 states.
-        starts: the states that matter; none means the whole box.
+        starts: the states `[n]` that matter; none means the whole box.
         settings: by default the paper's fine mesh.
 
     Raises:

@@ -307,6 +307,9 @@ def expand(query: Query, motion: Trajectory) -> Expansion:
     """The second derivatives of V along an optimal motion with costates, by backward integration.
 
     -dS/dt = H_xx + A'S + S A - K' 2R K,  K = (2R)^-1 (H_ux + G'S), inputs at a bound left out.
+
+    Raises:
+        ValueError: if the motion has no costates.
     """
     from scipy.linalg import expm
 

@@ -98,7 +98,7 @@ class CausalityFreePlanner:
     def plan(
         self, query: Query, starts: Sequence[ArrayLike] = (), until: Until | None = None
     ) -> Plan:
-        """`ocp.plan` with this planner, by default to its last trajectory.
+        """`ocp.plan` for the starts `[n]` with this planner, by default to its last trajectory.
 
         Raises:
             ValueError: if a start does not fit.
@@ -107,7 +107,7 @@ class CausalityFreePlanner:
         return plan(self, query, starts, until or trajectories(self.most))
 
     def start(self, query: Query, starts: Sequence[Floats]) -> CausalityFreeState:
-        """The network's value as trained.
+        """The network's value as trained; `starts` `[n]` matter most.
 
         Raises:
             SolveError: NOT_APPLICABLE if no network knows such a query.

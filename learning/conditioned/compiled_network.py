@@ -65,7 +65,7 @@ class NetworkValue:
         return self.value_and_gradient(states)[1]
 
     def value_and_gradient(self, states: ArrayLike) -> tuple[Floats, Floats]:
-        """Both at once, for the price of the gradient."""
+        """V `[...]` and its gradient `[..., 3]` at states `[..., 3]`, at the latter's price."""
         rows, shape = _rows(states)
         values, gradients = np.empty(len(rows)), np.empty((len(rows), 3))
         _evaluate(*self.arguments, rows, values, gradients)

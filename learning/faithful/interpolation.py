@@ -139,7 +139,7 @@ class InterpolationPlanner:
     settings: InterpolationSettings = field(default_factory=InterpolationSettings)
 
     def start(self, query: Query, starts: Sequence[NDArray[np.float64]]) -> InterpolationState:
-        """The set-valued solution, and the first steps.
+        """The set-valued solution, and the first steps; `starts` `[n]` are not needed.
 
         Raises:
             SolveError: if the set-valued method does not apply, or inputs are bounded.

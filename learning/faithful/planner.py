@@ -69,7 +69,7 @@ class FaithfulPlanner:
         return cls(MetaWeights.load(PRINTED), seed)
 
     def start(self, query: Query, starts: Sequence[NDArray[np.float64]]) -> FaithfulState:
-        """The meta value function itself, for the whole space.
+        """The meta value function itself, for the whole space; `starts` `[n]` are not needed.
 
         Raises:
             ValueError: if the weights are of another robot.

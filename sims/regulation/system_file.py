@@ -124,6 +124,8 @@ def shipped_systems() -> dict[str, Path]:
 def need_controllable(A: Array, B: Array) -> None:
     """Hautus: [A - s I, B] has full rank at every eigenvalue s of A (Assumption 1 of the paper).
 
+    A is `[n, n]`, B `[n, m]`.
+
     Raises:
         ValueError: naming the mode that no input reaches.
     """
