@@ -3,8 +3,9 @@
 log V = log V_LQR + w'(phi(x) - phi(x_g)) is linear in the last layer w, and so is the costate where
 V is known: one regularised linear least-squares problem, no steps and no rates. How far w may go
 from the trained one is chosen by cross-validation over the motions: the policy's excess on those
-left out. What is chosen is adopted only if it lowers the Hamilton-Jacobi residual at held-out
-states too, where no motion is needed; so the held-out residual never gets worse.
+left out. What is chosen is adopted only if it is better there by more than a standard error, and
+lowers the Hamilton-Jacobi residual at held-out states too, where no motion is needed; so the
+held-out residual never gets worse.
 """
 
 from collections.abc import Sequence
@@ -90,20 +91,28 @@ def adapt(
     before = guard_score(value, held_out)
     stay = Adapted(value, np.inf, before, before)
     equations, w = equations_of(value, samples), value.weights.last.numpy()
-    motion = np.arange(len(samples)) // POINTS
-    errors = np.zeros(1 + len(strengths))
-    for fold in range(FOLDS):
-        left_out = motion % FOLDS == fold
-        if left_out.any() and not left_out.all():
-            fits = [w, *equations.solve(w, strengths, ~left_out)]
-            errors += [np.log1p(equations.excess(fit)[left_out]).sum() for fit in fits]
-    best = int(np.argmin(errors))  # the first of equals: staying
-    if best == 0:
+    errors = _left_out_errors(equations, w, strengths)
+    best = int(np.argmin(errors.mean(axis=0)))  # the first of equals: staying
+    gain = errors[:, 0] - errors[:, best]
+    if not gain.mean() > gain.std() / np.sqrt(len(gain)):
         return stay
     strength = strengths[best - 1]
     adapted = refit(value, samples, [strength])[0]
     after = guard_score(adapted, held_out)
     return Adapted(adapted, strength, before, after) if after < before else stay
+
+
+def _left_out_errors(equations: Equations, w: Array, strengths: Sequence[float]) -> Array:
+    """Mean log(1 + excess) of each motion, left out, `[motions, 1 + strengths]`; first of `w`."""
+    motion = np.arange(len(equations.wanted)) // POINTS
+    errors = np.zeros((int(motion[-1]) + 1 if len(motion) else 1, 1 + len(strengths)))
+    for fold in range(FOLDS):
+        left_out = motion % FOLDS == fold
+        if left_out.any() and not left_out.all():
+            for k, fit in enumerate([w, *equations.solve(w, strengths, ~left_out)]):
+                excess = np.log1p(equations.excess(fit)[left_out])
+                np.add.at(errors[:, k], motion[left_out], excess / POINTS)
+    return errors
 
 
 def refit(value: NetworkValue, samples: Samples, strengths: Sequence[float]) -> list[NetworkValue]:

@@ -20,7 +20,6 @@ from learning.causality_free.samples import Samples
 from learning.causality_free.value import NetworkValue
 from ocp.planning import Plan, Until, plan, trajectories
 from ocp.query import Query
-from ocp.regulation import RegulatorValue
 from ocp.value import GreedyPolicy, greedy
 
 Floats = NDArray[np.float64]
@@ -127,8 +126,7 @@ class CausalityFreePlanner:
             return state
         count = min(BATCH, state.most - len(state.optima))
         starts = self._starts(state, count)
-        values = [state.value, RegulatorValue(state.query)]
-        found = exact_trajectories(state.query, values, starts, continuation=False)
+        found = exact_trajectories(state.query, [state.value], starts, continuation=False)
         optima = (*state.optima, *(optimum for optimum in found if optimum is not None))
         state = replace(
             state, optima=optima, asked=state.asked + count, pending=state.pending[count:]
