@@ -10,9 +10,11 @@ average of functions that satisfy the condition nearly does, kinks of V included
 multilinear there. In every cell the ratio of the two sides is bounded (`subsolution_kernels`), with
 W bounded from below by interval arithmetic. Where the ratio exceeds 1 the value is solved anew for
 a running cost that is smaller there; some rounds suffice. What violation is left is removed by
-w = phi(v), phi' = 1 / the largest ratio on the level set, phi = 0 below a first level. The maximum
-of subsolutions is one: near the goal the radial bound takes over, R = (2 / c) times the integral of
-sqrt(Q), c the largest speed of the position at unit effort.
+w = phi(v), phi' = 1 / the largest ratio on the level set.
+
+Near the goal, where V is not smooth, a bound U that knows the goal only is better (`goal_bound`).
+The maximum of subsolutions is one: max(U, phi(v)) where v is above a first level, and U where it is
+not; phi begins with the least U on that level set, so that the two meet.
 
 A motion may leave the grid's box, where w says nothing. It then costs at least the way to the edge
 at the least W outside the goal's surroundings, plus R there: the bound is never above that.
@@ -26,12 +28,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.compiled.batch import state_costs
-from ocp.cost import goal_cost
 from ocp.grid import Grid, GridValue
 from ocp.grids import subsolution_kernels as kernels
 from ocp.grids.fast_marching import marched
+from ocp.grids.goal_bound import GoalBound, RadialGoalBound, goal_ball, goal_bound, goal_costs
 from ocp.interval import bounds
-from ocp.query import Goal, Query
+from ocp.query import Query
 from ocp.trajectory import SolveError, Status
 
 Array = NDArray[np.float64]
@@ -39,10 +41,12 @@ Array = NDArray[np.float64]
 NODES = 240_000
 FACTOR = 3  # finer grid in which w is multilinear
 MARGIN = 1.5  # metres around the robot's domain
-FREE_ROUNDS, LAST_ROUNDS = 4, 4  # the cost's factor may grow again in the first ones only
+FREE_ROUNDS, LAST_ROUNDS = 4, 5  # the cost's factor may grow again in the first ones only
+REACH = 1  # nodes beside a violation whose factor falls too, in the last rounds: alone, it persists
 CAUTION = 1.3  # exponent of a round's correction in the last ones
 LEVEL = 0.02  # of cost: width of phi's pieces
-CUTS = (0.1, 0.15, 0.2, 0.3, 0.45)  # of cost: first levels that are tried
+CUTS = (0.15, 0.3, 0.5, 0.8, 1.2)  # of cost: first levels that are tried
+USUAL_CUT = 0.8  # during the rounds
 SLACK = 1e-9  # relative: covers rounding in the bounds
 RIM_SLACK = 0.02  # of cost: R at the rim of the surroundings is at most so much above the bound's
 SURROUNDINGS = 0.8  # metres around the goal whose W does not count in the way to the edge
@@ -73,9 +77,10 @@ class LowerBound:
     Attributes:
         query: of which V.
         potential: the multilinear function before `levels`.
-        levels: `[k]`, phi at multiples of `LEVEL`.
+        levels: `[k]`, phi at multiples of `LEVEL`; only what is above `cut` counts.
         worst: largest ratio that phi had to make up for.
         cut: the first level.
+        near: U.
     """
 
     query: Query
@@ -83,6 +88,7 @@ class LowerBound:
     levels: Array
     worst: float
     cut: float
+    near: GoalBound
 
     def value(self, states: ArrayLike) -> Array:
         """The bound `[...]` at states `[..., n]`; in the goal 0.
@@ -94,9 +100,11 @@ class LowerBound:
         inside = self.potential.value(states)
         known = np.where(np.isfinite(inside), inside, 0.0)
         marks = LEVEL * np.arange(len(self.levels))
-        w = np.interp(known, marks, self.levels)
-        radial = self._radial(self.query.goal_distance(states))
-        bound = np.maximum(radial, np.minimum(w, self._leaving(self.query.position(states))))
+        w = np.where(known > self.cut, np.interp(known, marks, self.levels), 0.0)
+        near = np.maximum(self._radial(self.query.goal_distance(states)), 0.0)
+        if np.isfinite(inside).any():  # U is known in the box only
+            near = np.where(np.isfinite(inside), np.maximum(near, self.near.value(states)), near)
+        bound = np.maximum(near, np.minimum(w, self._leaving(self.query.position(states))))
         return np.where(self.query.goal_distance(states) <= 0, 0.0, bound * (1 - SLACK))
 
     def bracket(self, start: ArrayLike, upper: float) -> Bracket:
@@ -104,7 +112,7 @@ class LowerBound:
         return Bracket(float(self.value(start)), float(upper))
 
     def _radial(self, distance: Array) -> Array:
-        return radial_bound(self.query, np.maximum(distance, 0.0))
+        return _radial(self.query).at(np.maximum(distance, 0.0))
 
     def _leaving(self, positions: Array) -> Array:
         """Least cost of a motion that leaves the box: to its edge, and on to the goal.
@@ -116,12 +124,12 @@ class LowerBound:
         query = self.query
         flat = positions.reshape(-1, 2)
         gaps = np.linalg.norm(flat[:, None] - edges, axis=-1) - spare
-        rim = _ball(query).radius + SURROUNDINGS
-        rate = 2.0 / _largest_speed(query) * float(np.sqrt(_goal_costs(query, np.array([rim])))[0])
+        rim = goal_ball(query).radius + SURROUNDINGS
+        rate = 2.0 / _largest_speed(query) * float(np.sqrt(goal_costs(query, np.array([rim])))[0])
         direct = rate * np.maximum(gaps, 0.0)
-        within = float(radial_bound(query, np.array([SURROUNDINGS]))[0]) + RIM_SLACK
+        within = float(self._radial(np.array([SURROUNDINGS]))[0]) + RIM_SLACK
         here = self._radial(
-            np.linalg.norm(flat - _ball(query).center, axis=1) - _ball(query).radius
+            np.linalg.norm(flat - goal_ball(query).center, axis=1) - goal_ball(query).radius
         )
         through = np.maximum(here - within, 0.0)[:, None] + np.maximum(onward - within, 0.0)
         least = (np.minimum(direct, through) + onward).min(axis=1)
@@ -136,36 +144,11 @@ class LowerBound:
         sides += [np.column_stack([np.full(count, end), y]) for end in (x[0], x[-1])]
         edges = np.concatenate(sides)
         spare = max(x[1] - x[0], y[1] - y[0]) / 2
-        away = np.linalg.norm(edges - _ball(self.query).center, axis=1) - _ball(self.query).radius
+        away = (
+            np.linalg.norm(edges - goal_ball(self.query).center, axis=1)
+            - goal_ball(self.query).radius
+        )
         return edges, self._radial(away - spare), spare
-
-
-def radial_bound(query: Query, distances: Array) -> Array:
-    """R `[k]` at distances `[k]` >= 0 from the goal's boundary, from below.
-
-    Q grows with the distance, so the sum with each piece's least sqrt(Q) is below the integral.
-    """
-    knots, sums, rates = _radial_table(query, float(np.ceil(distances.max(initial=1.0) / 16) * 16))
-    k = np.searchsorted(knots, distances, side="right") - 1
-    return (sums[k] + rates[k] * (distances - knots[k])) * (1 - SLACK)
-
-
-@lru_cache(maxsize=16)
-def _radial_table(query: Query, reach: float) -> tuple[Array, Array, Array]:
-    """Distances, R and its least slope from each to the next."""
-    knots = np.concatenate([[0.0], np.geomspace(1e-6, reach + 1e-3, 4000)])
-    speed = _largest_speed(query)
-    rates = 2.0 / speed * np.sqrt(_goal_costs(query, _ball(query).radius + knots))
-    sums = np.concatenate([[0.0], np.cumsum(rates[:-1] * np.diff(knots))])
-    return knots, sums, rates
-
-
-def _goal_costs(query: Query, radii: Array) -> Array:
-    """Q `[k]` at distances `[k]` from the goal's centre."""
-    w = query.cost
-    r = ca.SX.sym("r")  # pyright: ignore[reportArgumentType]
-    cost = goal_cost(r, ca.SX(0), _ball(query).radius, w.goal, w.goal_steepness)
-    return np.array(ca.Function("Q", [r], [cost])(radii[None])).ravel()
 
 
 def lower_bound(query: Query, nodes: int = NODES, factor: int = FACTOR) -> LowerBound:
@@ -191,7 +174,7 @@ def lower_bound(query: Query, nodes: int = NODES, factor: int = FACTOR) -> Lower
     best: LowerBound | None = None
     for k in range(FREE_ROUNDS + LAST_ROUNDS):
         work.solve(scale)
-        if k >= FREE_ROUNDS - 1:
+        if k >= FREE_ROUNDS + LAST_ROUNDS - 2:
             found = work.certified()
             if best is None or found.levels[-1] > best.levels[-1]:
                 best = found
@@ -233,13 +216,12 @@ class _Correction:
         self.sag = np.ascontiguousarray(np.broadcast_to(sag, cells)) * (1 + SLACK)
         nodes = np.stack(np.meshgrid(x, y, [0.0], indexing="ij"), axis=-1)
         self.corner = np.ascontiguousarray(state_costs(query, nodes)[..., 0]) * (1 - SLACK)
-        center = np.array(_ball(query).center)
-        nearest = [np.clip(c, a, b) - c for c, (a, b) in zip(center, boxes, strict=True)]
-        distance = np.hypot(*np.broadcast_arrays(*nearest)) - _ball(query).radius
-        self.in_goal = distance <= 0
-        self.radial = radial_bound(query, np.maximum(distance, 0.0).ravel()).reshape(cells)
         headings = np.append(self.fine.axes[2], self.fine.upper[2]) if last else self.fine.axes[2]
         self.inputs, self.bend = _input_matrices(query, headings)
+        corners = np.array([grid.lower[:2], grid.upper[:2]]) - goal_ball(query).center
+        reach = float(np.hypot(*abs(corners).max(axis=0)))
+        self.near = goal_bound(query, _largest_speed(query), reach)
+        self.floor = self.near.floors(x, y, np.ascontiguousarray(headings))
 
     def solve(self, scale: Array) -> None:
         values = marched(self.query, self.grid, scale=scale).values
@@ -253,56 +235,65 @@ class _Correction:
         closed = self.values
         if self.fine.periodic[2]:
             closed = np.concatenate([closed, closed[:, :, :1]], axis=2)
+        self.closed = np.ascontiguousarray(closed)
         shape = tuple(count - 1 for count in closed.shape)
         self.ratio, self.low, self.high = (np.empty(shape) for _ in range(3))
         kernels.cell_ratios(
-            np.ascontiguousarray(closed), self.fine.spacing, self.inputs, self.bend, self.corner,
+            self.closed, self.fine.spacing, self.inputs, self.bend, self.corner,
             self.sag, self.cost, self.ratio, self.low, self.high,
         )  # fmt: skip
 
-    def _active(self, cut: float) -> Array:
-        """1 where phi(v) may be above the radial bound, which takes over elsewhere."""
-        return (self.high - cut > self.radial[:, :, None]).astype(float)
+    def _active(self, first: float, least: float) -> Array:
+        """1 where phi(v), `least` at v = `first`, may be above U, which takes over elsewhere."""
+        above = least + (self.high - first) > self.floor
+        return (above & (self.high > first)).astype(float)
+
+    def _least(self, first: float) -> float:
+        """Where phi begins: at most U on the level set of v, and at most v.
+
+        The least over whole cells is some 0.2 too low. That is no loss: around the goal, where a
+        grid resolves v worst, phi(v) is then below U and need not be a subsolution.
+        """
+        met = (self.low <= first) & (self.high >= first)
+        return float(self.floor[met].min(initial=first))
 
     def corrected(self, scale: Array, growing: bool) -> Array:
         """A factor of the cost for the next round: less where the ratio exceeds 1."""
         found = np.full(scale.shape, 0.5 if growing else 1.0)
-        kernels.node_ratios(self.ratio, self._active(CUTS[-2]), self.factor, found)
+        active = self._active(USUAL_CUT, self._least(USUAL_CUT))
+        kernels.node_ratios(self.ratio, active, self.factor, 0 if growing else REACH, found)
         change = np.clip(found, 0.95, 1.3) ** (-1.0 if growing else -CAUTION)
         return np.clip(scale * change, 0.5, 1.0)
 
     def certified(self) -> LowerBound:
         """phi for the best of the first levels."""
         best: LowerBound | None = None
-        top = float(self.high.max())
-        count = int(top / LEVEL) + 2
-        # In the goal w must not be positive: phi begins above the values there.
-        goal_top = float(self.high[self.in_goal].max()) if self.in_goal.any() else 0.0
+        count = int(float(self.high.max()) / LEVEL) + 2
         for cut in CUTS:
-            first = max(cut, goal_top)
+            begin = min(int(np.ceil(cut / LEVEL)), count - 1)
+            first = LEVEL * begin
+            least = self._least(first)
             ratios = np.ones(count)
-            kernels.level_ratios(
-                self.ratio, self.low, self.high, self._active(first), LEVEL, ratios
-            )
+            active = self._active(first, least)
+            kernels.level_ratios(self.ratio, self.low, self.high, active, LEVEL, ratios)
             slopes = 1.0 / (ratios * (1 + SLACK))
-            slopes[: int(np.ceil(first / LEVEL))] = 0.0
-            levels = np.concatenate([[0.0], np.cumsum(LEVEL * slopes)])
+            rises = LEVEL * slopes[begin:]
+            levels = np.concatenate([np.zeros(begin), least + np.cumsum([0.0, *rises])])
             if best is None or levels[-1] > best.levels[-1]:
-                worst = float(ratios[slopes > 0].max())
+                worst = float(ratios[begin:].max())
                 value = GridValue(self.fine, self.values)
-                best = LowerBound(self.query, value, levels, worst, first)
+                best = LowerBound(self.query, value, levels, worst, first, self.near)
         assert best is not None
         return best
 
 
-def _ball(query: Query) -> Goal:
-    if not isinstance(query.goal, Goal):
-        raise SolveError(Status.NOT_APPLICABLE, "certified lower bounds need a goal ball")
-    return query.goal
+@lru_cache(maxsize=16)
+def _radial(query: Query) -> RadialGoalBound:
+    return RadialGoalBound(query, _largest_speed(query))
 
 
 def _check(query: Query) -> None:
-    _ball(query)
+    goal_ball(query)
     system = query.system
     plain = query.cost.state is None and not query.cost.own
     if not query.is_time_free or system.n != 3 or tuple(system.position) != (0, 1) or not plain:

@@ -106,20 +106,20 @@ def level_ratios(ratio, low, high, active, step, out):
                         out[level] = max(out[level], ratio[i, j, k])
 
 
-@compiled(types.void(CUBE, CUBE, int64, CUBE))
-def node_ratios(ratio, active, factor, out):
+@compiled(types.void(CUBE, CUBE, int64, int64, CUBE))
+def node_ratios(ratio, active, factor, reach, out):
     """The largest ratio of the active fine cells around each node of the `factor` times coarser
-    grid, at least what `out` holds; the last axis is periodic."""
-    nodes = out.shape
+    grid, or of a node up to `reach` further; at least what `out` holds. The last axis is
+    periodic."""
+    nodes, least = out.shape, out.min()
     for i in range(ratio.shape[0]):
         for j in range(ratio.shape[1]):
             for k in range(ratio.shape[2]):
-                if active[i, j, k] > 0.0:
-                    r = ratio[i, j, k]
+                r = ratio[i, j, k]
+                if active[i, j, k] > 0.0 and r > least:
                     x, y, z = i // factor, j // factor, k // factor
-                    for a in range(2):
-                        for b in range(2):
-                            for c in range(2):
-                                p, q = min(x + a, nodes[0] - 1), min(y + b, nodes[1] - 1)
+                    for p in range(max(x - reach, 0), min(x + reach + 2, nodes[0])):
+                        for q in range(max(y - reach, 0), min(y + reach + 2, nodes[1])):
+                            for c in range(-reach, reach + 2):
                                 s = (z + c) % nodes[2]
                                 out[p, q, s] = max(out[p, q, s], r)

@@ -22,13 +22,22 @@ TOLERANCE = 1e-6
 notes = Console(stderr=True)
 
 
-def run(seed: int, _out: Path | None) -> Report:
-    """Upper bounds by rollout of the eikonal policy, lower bounds by subsolution."""
+def run(seed: int, _out: Path | None, queries: int = QUERIES) -> Report:
+    """Upper bounds by rollout of the eikonal policy, lower bounds by subsolution.
+
+    `queries` with `STARTS` starts each; what was found so far is on standard error all along.
+    """
     rng = np.random.default_rng(seed)
     gaps, gaps_known, wrong, crossed, checked, lost, seconds = [], [], 0, 0, 0, 0, []
     with notes.status("brackets") as status:
-        for k in range(QUERIES):
-            status.update(f"query {k + 1} of {QUERIES}")
+        for k in range(queries):
+            status.update(f"query {k + 1} of {queries}")
+            if k and k % 5 == 0:
+                notes.print(
+                    f"{len(gaps):,} brackets: {crossed} crossed, {wrong} of {checked} above an "
+                    f"exact cost, median gap {100 * np.median(gaps):.2f} %",
+                    highlight=False,
+                )
             query = PAPER_FAMILY.sample(rng)
             begun = time.process_time()
             bound = lower_bound(query)

@@ -9,9 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from references import TABLE_ONE_OPTIMA, aligned_value, typical_query
 
-from ocp.bracket import LowerBound, lower_bound, radial_bound
+from ocp.bracket import LowerBound, lower_bound
 from ocp.compiled.batch import rates, running_costs, state_costs
 from ocp.eikonal import solve_eikonal
+from ocp.grids.goal_bound import HeadingGoalBound, RadialGoalBound, goal_bound
+from ocp.grids.goal_table import goal_table
 from ocp.interval import bounds
 from ocp.pontryagin import exact_trajectory
 from ocp.query import Query
@@ -30,7 +32,7 @@ def test_the_optimum_lies_in_the_bracket(certified: LowerBound) -> None:
     assert any(exact == pytest.approx(known, rel=1e-5) for known in TABLE_ONE_OPTIMA.values())
     bracket = certified.bracket(PAPER_START, exact)
     assert bracket.lower <= exact
-    assert 0 < bracket.gap < 0.15
+    assert 0 < bracket.gap < 0.08
 
 
 def test_no_motion_costs_less(certified: LowerBound) -> None:
@@ -62,18 +64,50 @@ def test_along_any_short_motion_it_falls_by_no_more_than_the_cost(certified: Low
 
 
 def test_a_finer_grid_brings_a_better_bound() -> None:
-    query = paper_query((4.0, 4.0))
-    coarse = lower_bound(query, nodes=8_000, factor=2).value(PAPER_START)
-    fine = lower_bound(query, nodes=60_000, factor=3).value(PAPER_START)
-    assert coarse < fine <= TABLE_ONE_OPTIMA[4.0, 4.0]
+    """On average over states, some of which obstacles do not concern."""
+    query, rng = paper_query((1.0, 1.0)), np.random.default_rng(7)
+    states = np.array([sample_start(query, rng) for _ in range(200)])
+    coarse = lower_bound(query, nodes=8_000, factor=2).value(states)
+    fine = lower_bound(query, nodes=60_000, factor=3).value(states)
+    assert coarse.mean() < fine.mean()
 
 
 def test_the_radial_bound_is_the_closed_form_from_below() -> None:
-    query = paper_query((4.0, 4.0))
+    bound = RadialGoalBound(paper_query((4.0, 4.0)), 1.0)
     for distance in (0.01, 0.3, 2.0, 9.0):
         exact = aligned_value(0.5 + distance)
-        bound = float(radial_bound(query, np.array([distance]))[0])
-        assert exact * (1 - 0.01) < bound <= exact
+        assert exact * (1 - 0.01) < float(bound.at(np.array([distance]))[0]) <= exact
+
+
+def test_the_bound_that_knows_headings_is_below_the_table_and_near_it() -> None:
+    """The table is exact to 1e-5; phi's first level and the cells' ratios cost some
+    0.5 % far from the goal, and a hundredth of cost near it."""
+    query = paper_query((4.0, 3.0))
+    bound = goal_bound(query, 1.0, 18.0)
+    assert isinstance(bound, HeadingGoalBound)
+    rng = np.random.default_rng(5)
+    states = np.array([sample_start(query, rng) for _ in range(500)])
+    near = np.array([[*(query.reference[:2] + 0.6 * np.array([c, s])), h] for c, s, h in
+                     [(1.0, 0.0, 1.5), (0.0, 1.0, 0.1), (0.6, -0.8, 2.0)]])  # fmt: skip
+    for rows in (states, near):
+        exact = goal_table(query, 18.0).value(rows)
+        assert (bound.value(rows) <= exact * (1 + 1e-5)).all()
+        assert (bound.value(rows) >= 0.97 * exact - 0.02).all()
+
+
+def test_no_point_of_a_cell_is_below_its_floor() -> None:
+    query = paper_query((4.0, 3.0))
+    x, y, headings = np.linspace(2, 6, 41), np.linspace(-1, 5, 41), np.linspace(-np.pi, 0, 20)
+    rng = np.random.default_rng(6)
+    i, j, k = rng.integers(0, 40, 9000), rng.integers(0, 40, 9000), rng.integers(0, 19, 9000)
+    points = np.column_stack(
+        [rng.uniform(axis[n], axis[n + 1]) for axis, n in ((x, i), (y, j), (headings, k))]
+    )
+    for bound in (goal_bound(query, 1.0, 12.0), RadialGoalBound(query, 1.0)):
+        floors = bound.floors(x, y, headings)
+        values = bound.value(points)
+        assert (floors[i, j, k] <= values + 1e-12).all()
+        assert np.median(values - floors[i, j, k]) < 0.5
 
 
 def test_in_the_goal_and_outside_the_grid(certified: LowerBound) -> None:
@@ -81,8 +115,8 @@ def test_in_the_goal_and_outside_the_grid(certified: LowerBound) -> None:
     inside = np.array([*query.reference[:2], 0.3])
     assert float(certified.value(inside)) == 0.0
     outside = np.array([40.0, 0.0, 0.0])
-    expected = radial_bound(query, np.array([float(query.goal_distance(outside))]))[0]
-    assert float(certified.value(outside)) == pytest.approx(expected, rel=1e-6)
+    expected = RadialGoalBound(query, 1.0).at(np.array([float(query.goal_distance(outside))]))[0]
+    assert float(certified.value(outside)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_the_way_outside_costs_the_way_to_the_edge_and_on(certified: LowerBound) -> None:
