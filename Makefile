@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test notebooks reproduce docs lint clean
+.PHONY: demo test notebooks reproduce docs lint clean newcomer
 
 .venv/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -20,6 +20,10 @@ notebooks: .venv/installed
 
 reproduce: .venv/installed
 	$(BIN)/zermelo reproduce all --quick --out out/reproduce
+
+# Times a newcomer's path on a clean clone.
+newcomer:
+	.ci/newcomer
 
 docs: .venv/installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict

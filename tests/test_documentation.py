@@ -57,6 +57,25 @@ def test_every_equation_has_its_function(page: str) -> None:
     assert set(range(1, TABLES[page] + 1)) <= told
 
 
+QUERIES = [
+    pytest.param(block, id=f"{page.stem}-{k}")
+    for page in PAGES
+    for k, block in enumerate(
+        re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    )
+    if re.search(r"^model = ", block, re.MULTILINE)
+]
+
+
+@pytest.mark.parametrize("text", QUERIES)
+def test_query_files_in_the_documentation_load(text: str, tmp_path: Path) -> None:
+    from ocp.query import Query
+
+    path = tmp_path / "query.toml"
+    path.write_text(text, encoding="utf-8")
+    assert Query.load(path).system.n > 0
+
+
 def test_look_up_refuses_what_is_not_there() -> None:
     with pytest.raises(AttributeError):
         look_up("ocp.query.Qwery")

@@ -19,3 +19,11 @@ def test_bring_your_own_robot_swings_it_up_in_drake() -> None:
     numbers = re.findall(r"-?\d+\.\d*", run.stdout.split("after 6 s:")[1])
     end = np.array([float(x) for x in numbers])
     np.testing.assert_allclose(np.abs(end), [0.0, np.pi, 0.0, 0.0], atol=0.01)
+
+
+@pytest.mark.notebook
+def test_a_cost_of_ones_own_is_planned_within_a_third_of_a_per_cent() -> None:
+    path = EXAMPLES / "own_cost.py"
+    run = subprocess.run([sys.executable, path], capture_output=True, text=True, check=True)
+    found, exact = (float(x) for x in re.findall(r"\d+\.\d+", run.stdout))
+    assert -1e-4 < found / exact - 1 < 3e-3
