@@ -102,7 +102,7 @@ def _diagonal(entries: list[float]) -> tuple[tuple[float, ...], ...]:
 
 
 def loaded_quadrotor(load: float, weights: list[float], effort: float, goal: Array) -> Query:
-    """The planar quadrotor with its mass and its inertia `load` times as large.
+    """The planar quadrotor, flying to `goal` `[6]`, its mass and inertia `load` times as large.
 
     Thrusts divided by `load` move it as they move the empty one, so the query is one of the empty
     quadrotor: its limits are divided by `load`, its weight of effort is multiplied by `load`^2.

@@ -271,7 +271,7 @@ def _map(family: RegulationFamily, seed: int, out: Path) -> None:
     states = states[np.abs(offsets).max(axis=1) > 0]
     exact = _optima(query, (linear, value), states)
     figure, panels = plt.subplots(1, 2, figsize=(9.6, 4.0), layout="constrained", sharey=True)
-    shown = None
+    shown: Any = None
     for panel, rival, title in zip(
         panels, (linear, value), ("linear regulator", "network"), strict=True
     ):
