@@ -25,16 +25,16 @@ JUDGED = 25
 notes = Console(stderr=True)
 
 
-def run(seed: int, out: Path | None) -> Report:
-    """`CALLS` calls of each method, deadlines in turn, fresh queries and starts."""
+def run(seed: int, out: Path | None, calls: int = CALLS) -> Report:
+    """`calls` of each method, deadlines in turn, fresh queries and starts."""
     report = Report()
-    table = Table(title=f"Lateness over {CALLS:,} calls a method (negative: early)")
+    table = Table(title=f"Lateness over {calls:,} calls a method (negative: early)")
     columns = ("method", "deadline, ms", "calls", "median, ms", "99 %", "99.9 %", "worst")
     for column in (*columns, "within 5 ms", "reached"):
         table.add_column(column, justify="left" if column == "method" else "right")
     rows = []
     for method in CONTENDERS:
-        rows += _soak(method, np.random.default_rng(seed), CALLS)
+        rows += _soak(method, np.random.default_rng(seed), calls)
     for row in rows:
         table.add_row(
             row["method"],

@@ -126,7 +126,7 @@ def killed_fillings(folder: Path, kills: int, seed: int, count: int, nodes: int)
             if run.poll() is None:
                 run.send_signal(signal.SIGKILL)
             run.wait()
-            _wait_for_group(run.pid)
+            wait_for_group(run.pid)
             store = Store(folder)
             found = set(store)
             in_the_work += len(found - seen) > 0
@@ -140,7 +140,7 @@ def killed_fillings(folder: Path, kills: int, seed: int, count: int, nodes: int)
     return Kills(kills, in_the_work, damaged, len(seen - set(store)), len(store), partial)
 
 
-def _wait_for_group(group: int) -> None:
+def wait_for_group(group: int) -> None:
     """Until the workers of a killed run have noticed that it is gone."""
     for _ in range(10_000):
         try:
