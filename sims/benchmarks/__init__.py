@@ -21,6 +21,7 @@ BENCHMARKS: dict[str, str] = {
     "execution": "speed-up of two workers, what Dask adds a task, worker deaths survived",
     "faithful": "the paper's meta value learning, as printed and repaired, on fresh queries",
     "grids": "eikonal and set-valued grids: time, value error, closed-loop excess",
+    "headline": "every headline time in one run: median, spread, ratio to a reference; memory",
     "lqr": "analytic LQR: Riccati, matrix exponential, collocation and PMP",
     "navigation": "RRT-Q^X: random dynamic scenarios, rules, crowds, several robots (hours)",
     "orders": "orders of convergence of the grid schemes, on and off the axis",

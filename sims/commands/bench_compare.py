@@ -1,7 +1,8 @@
 """Two results of `zermelo bench` held against each other: what moved by more than noise.
 
 Times are divided by a reference that each run measures itself (`reference_seconds`), so that a
-slower or busier machine does not count as a change.
+slower or busier machine does not count as a change. Where a figure was repeated and its spread is
+beside it, the spread makes the band of noise.
 """
 
 import json
@@ -17,6 +18,12 @@ TIME_NOISE = 0.25
 """Part by which a time, over its run's reference, may differ without having moved."""
 FIGURE_NOISE = 0.05
 """Likewise for every other figure."""
+SPREAD = "spread"
+"""Name of a figure that says how much those beside it vary when repeated, as a part of them."""
+SPREADS = 3.0
+"""A repeated figure has moved if it differs by more than so many times both spreads together."""
+LEAST_NOISE = 0.05
+"""But never for less than this."""
 TINY = 1e-9
 """Figures of this size count as 0: a rounding error that doubles has not moved."""
 
@@ -36,11 +43,17 @@ def reference_seconds(repeats: int = 30) -> float:
     times = []
     for _ in range(repeats):
         begun = time.perf_counter()
-        total = 0
-        for k in range(200_000):
-            total += k * k
+        plain_work()
         times.append(time.perf_counter() - begun)
     return min(times)
+
+
+def plain_work() -> int:
+    """A fixed amount of plain Python: some 10 ms of a 2020s core."""
+    total = 0
+    for k in range(200_000):
+        total += k * k
+    return total
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -70,17 +83,27 @@ def moves(before: dict[str, Any], after: dict[str, Any]) -> list[Move]:
         old = dict(_figures(before["benchmarks"][name], name))
         new = dict(_figures(after["benchmarks"][name], name))
         for key in sorted(old.keys() | new.keys()):
+            if key.rpartition(".")[2] == SPREAD:
+                continue
             a, b = old.get(key), new.get(key)
             if a is None or b is None:
                 found.append(Move(key, a, b, None))
                 continue
             timed = _is_time(key)
             size_a, size_b = (a * pace, b) if timed else (a, b)
-            noise = TIME_NOISE if timed else FIGURE_NOISE
+            noise = _noise(key, old, new) or (TIME_NOISE if timed else FIGURE_NOISE)
             largest = max(abs(size_a), abs(size_b))
             if largest > TINY and abs(size_a - size_b) > noise * largest:
                 found.append(Move(key, a, b, size_b / size_a if size_a else None))
     return found
+
+
+def _noise(key: str, old: dict[str, float], new: dict[str, float]) -> float | None:
+    """From the spreads beside a figure, if both results have them."""
+    beside = f"{key.rpartition('.')[0]}.{SPREAD}"
+    if beside not in old or beside not in new:
+        return None
+    return max(LEAST_NOISE, SPREADS * (old[beside] + new[beside]))
 
 
 def table(found: list[Move], file: Path) -> Table:

@@ -59,3 +59,16 @@ def test_a_result_is_read_back(tmp_path: Path) -> None:
     path.write_text(json.dumps(result(x=1.0)))
     assert load(path) == result(x=1.0)
     assert reference_seconds(3) > 0
+
+
+def test_a_repeated_figure_is_held_against_its_own_spread() -> None:
+    """Three times both spreads, and a twentieth at least; the spread itself is no figure."""
+
+    def repeated(median: float, spread: float) -> dict[str, Any]:
+        return result(grid={"over_reference": median, "spread": spread})
+
+    assert names(repeated(1.0, 0.02), repeated(1.12, 0.02)) == []
+    assert names(repeated(1.0, 0.02), repeated(1.15, 0.02)) == ["grids.grid.over_reference"]
+    assert names(repeated(1.0, 0.001), repeated(1.04, 0.001)) == []
+    assert names(repeated(1.0, 0.001), repeated(1.07, 0.001)) == ["grids.grid.over_reference"]
+    assert names(repeated(1.0, 0.001), repeated(1.0, 0.2)) == []
