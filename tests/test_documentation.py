@@ -57,6 +57,14 @@ def test_every_equation_has_its_function(page: str) -> None:
     assert set(range(1, TABLES[page] + 1)) <= told
 
 
+def test_every_page_is_in_the_contents() -> None:
+    contents = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    missing = {page.relative_to(ROOT / "docs").as_posix() for page in PAGES} - set(
+        re.findall(r": ([\w/-]+\.md)$", contents, re.MULTILINE)
+    )
+    assert not missing
+
+
 QUERIES = [
     pytest.param(block, id=f"{page.stem}-{k}")
     for page in PAGES
