@@ -1,4 +1,4 @@
-"""The headline benchmark's clock: its ratios are of processor time, wide apart on a busy machine."""
+"""The headline benchmark's clock: ratios of processor time, still uneven on busy machines."""
 
 from sims.benchmarks.headline import repeated
 from sims.commands.bench_compare import plain_work
