@@ -16,6 +16,7 @@ from ocp.query_family import paper_query
 from ocp.query_file import query_from_dict, query_to_dict, read_toml
 from ocp.trajectory import SolveError
 from sims.closed_loop import LoopSettings, rollouts
+from sims.disturbance import Disturbance
 
 GOOD: dict[str, Any] = query_to_dict(paper_query((1.0, 4.0)))
 GOOD["cost"] = {"goal": 1.0, "input": [1.0, 1.0]}
@@ -233,3 +234,31 @@ def test_any_valid_query_ends_in_a_value_or_a_status(
     values = solution.value.on_grid.values
     assert not np.isnan(values).any()
     assert (values >= 0).all()
+
+
+# What closed loops and grids are given
+
+
+@MANY
+@given(
+    shares=st.tuples(NUMBERS, NUMBERS), noise=st.lists(NUMBERS, max_size=4),
+    delay=st.integers(-3, 3), limit=NUMBERS,
+)  # fmt: skip
+def test_any_numbers_as_a_disturbance(shares: tuple, noise: list, delay: int, limit: Any) -> None:
+    """Refused in words, or the loop ends in finite numbers."""
+    query = SOLUTION.query
+    try:
+        disturbance = Disturbance(
+            shares[0], shares[1], process=tuple(noise), delay=delay, limit=limit
+        )
+        loops = rollouts(
+            SOLUTION.policy(),
+            [[-4.0, -4.0, 0.0]],
+            LoopSettings(period=0.1, time_limit=0.3),
+            disturbance,
+        )
+    except (ValueError, OverflowError) as error:
+        assert_said(error)
+        return
+    assert np.isfinite(loops[0].trajectory.inputs).all()
+    assert loops[0].query == query
