@@ -52,6 +52,11 @@ def deadline(seconds: float) -> Until:
     return Until(lambda p: p.seconds >= seconds)
 
 
+def never() -> Until:
+    """No end but the planner's own: until there is nothing left to refine."""
+    return Until(lambda _: False)
+
+
 def iterations(count: int) -> Until:
     """Stop after `count` refinements.
 

@@ -1,4 +1,4 @@
-"""What learning buys: closed loops on fresh queries against exact costs, and against time.
+"""What learning buys: closed loops on fresh queries against exact costs.
 
 Three families: the paper's, the general one, and the general one with seven to ten obstacles, which
 no network was trained on. The queries' seeds are far from those of training. Reached means within
@@ -23,7 +23,7 @@ from ocp.eikonal import solve_eikonal
 from ocp.extremals.extremal import find_extremal
 from ocp.extremals.warm_start import rollouts as rough
 from ocp.family_file import load_family, with_obstacle_count
-from ocp.planning import Until, deadline, iterations, trajectories
+from ocp.planning import Planner, Until, iterations, plan, trajectories
 from ocp.pontryagin import exact_trajectory
 from ocp.query import Query
 from ocp.query_family import QueryFamily, sample_start
@@ -35,10 +35,18 @@ from sims.closed_loop import LoopSettings, rollouts
 
 SEED = 1_000_000  # added to the benchmark's seed: no training or selection saw these queries
 QUERIES, STARTS = 100, 20
-BUDGETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-CURVE_QUERIES, CURVE_STARTS = 20, 4
-NODES = (1_000, 2_000, 4_500, 9_000, 18_000, 36_000, 60_000, 120_000, 240_000, 480_000)
-LOOP = LoopSettings(time_limit=40.0)
+FIGURES = (
+    "reached",
+    "aggregate_excess",
+    "median_excess",
+    "excess_95",
+    "largest_excess",
+    "least_excess",
+    "new_collisions",
+    "reaction_median_s",
+    "reaction_95_s",
+)
+TIME_LIMIT = 40.0  # seconds of a closed loop
 notes = Console(stderr=True)
 
 Solver = Callable[[Query, list[NDArray[np.float64]]], tuple[Policy, float]]
@@ -62,33 +70,44 @@ class Score:
     new_collisions: list[bool] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
 
-    def add(self, problem: Problem, policy: Policy, seconds: float) -> None:
-        """Close the loop from every start."""
+    def add(
+        self, problem: Problem, policy: Policy, seconds: float, period: float = LoopSettings.period
+    ) -> None:
+        """Close the loop from every start, each input held for `period` seconds."""
         self.seconds.append(seconds)
-        loops = rollouts(policy, problem.starts, LOOP)
+        loops = rollouts(policy, problem.starts, LoopSettings(period, TIME_LIMIT))
         for loop, optimum in zip(loops, problem.optima, strict=True):
             clear = float(problem.query.clearance(optimum.states).min()) >= 0
             self.costs.append(np.nan if loop.cost is None else loop.cost)
             self.optima.append(optimum.cost)
             self.new_collisions.append(loop.collided and clear)
 
-    def figures(self) -> dict[str, float]:
-        """Everything measured, as fractions and seconds."""
+    def add_failure(self, problem: Problem) -> None:
+        """There was no policy: no start reaches the goal."""
+        self.costs += [np.nan] * len(problem.starts)
+        self.optima += [optimum.cost for optimum in problem.optima]
+
+    def figures(self) -> dict[str, float | None]:
+        """Everything measured, as fractions and seconds; `None` where there was nothing."""
         cost, optimum = np.array(self.costs), np.array(self.optima)
         reached = np.isfinite(cost)
         cost, optimum = cost[reached], optimum[reached]
         excess = cost / optimum - 1
-        return {
-            "reached": float(reached.mean()),
-            "aggregate_excess": float(cost.sum() / optimum.sum() - 1),
-            "median_excess": float(np.median(excess)),
-            "excess_95": float(np.quantile(excess, 0.95)),
-            "largest_excess": float(excess.max()),
-            "least_excess": float(excess.min()),
-            "new_collisions": float(np.mean(self.new_collisions)),
-            "reaction_median_s": float(np.median(self.seconds)),
-            "reaction_95_s": float(np.quantile(self.seconds, 0.95)),
-        }
+        figures: dict[str, float | None] = dict.fromkeys(FIGURES)
+        figures["reached"] = float(reached.mean())
+        if reached.any():
+            figures |= {
+                "aggregate_excess": float(cost.sum() / optimum.sum() - 1),
+                "median_excess": float(np.median(excess)),
+                "excess_95": float(np.quantile(excess, 0.95)),
+                "largest_excess": float(excess.max()),
+                "least_excess": float(excess.min()),
+                "new_collisions": float(np.mean(self.new_collisions)),
+            }
+        if self.seconds:
+            figures["reaction_median_s"] = float(np.median(self.seconds))
+            figures["reaction_95_s"] = float(np.quantile(self.seconds, 0.95))
+        return figures
 
 
 def families() -> dict[str, QueryFamily]:
@@ -98,10 +117,8 @@ def families() -> dict[str, QueryFamily]:
     return {"paper": load_family("paper"), "general": load_family("general"), "crowded": crowded}
 
 
-def run(
-    seed: int, out: Path | None, queries: int = QUERIES, starts: int = STARTS, curve: bool = True
-) -> Report:
-    """All families, then the curve."""
+def run(seed: int, _out: Path | None, queries: int = QUERIES, starts: int = STARTS) -> Report:
+    """A table for each family."""
     report = Report()
     for name, family in families().items():
         scores: dict[str, Score] = {}
@@ -111,9 +128,6 @@ def run(
         figures = {method: score.figures() for method, score in scores.items()}
         report.figures[name] = figures
         report.tables.append(_table(f"{name}: {queries} queries x {starts} starts", figures))
-    if curve:
-        for name in ("paper", "general"):
-            _curve(report, name, seed, out)
     return report
 
 
@@ -144,21 +158,23 @@ def fixed_methods(family: str) -> dict[str, Solver]:
     alone = MetaPlanner.pretrained(network, grids=False)
     whole = MetaPlanner.pretrained(network)
     return {
-        "network": partial(_planned, alone, iterations(0)),
-        "network, 8 trajectories": partial(_planned, alone, trajectories(8)),
-        "adapt, 8 trajectories": partial(_planned, whole, trajectories(8)),
-        **{f"eikonal, {n:,} nodes": partial(_eikonal, n) for n in (4_500, 18_000, 60_000)},
+        "network": partial(planned, alone, iterations(0)),
+        "network, 8 trajectories": partial(planned, alone, trajectories(8)),
+        "adapt, 8 trajectories": partial(planned, whole, trajectories(8)),
+        **{f"eikonal, {n:,} nodes": partial(eikonal, n) for n in (4_500, 18_000, 60_000)},
     }
 
 
-def _planned(
-    planner: MetaPlanner, until: Until, query: Query, starts: list[NDArray[np.float64]]
+def planned(
+    planner: Planner, until: Until, query: Query, starts: list[NDArray[np.float64]]
 ) -> tuple[Policy, float]:
-    answer = planner.plan(query, starts, until)
+    """A plan's policy, and the seconds until it was ready."""
+    answer = plan(planner, query, starts, until)
     return answer.policy, answer.reaction_time
 
 
-def _eikonal(nodes: int, query: Query, _starts: list[NDArray[np.float64]]) -> tuple[Policy, float]:
+def eikonal(nodes: int, query: Query, _starts: list[NDArray[np.float64]]) -> tuple[Policy, float]:
+    """The policy of one grid, and the seconds that it took."""
     begun = time.perf_counter()
     policy = solve_eikonal(query, nodes=nodes).policy()
     return policy, time.perf_counter() - begun
@@ -170,64 +186,12 @@ def _measure(score: Score, problem: Problem, solver: Solver) -> None:
     score.add(problem, *solver(problem.query, problem.starts))
 
 
-def _curve(report: Report, name: str, seed: int, out: Path | None) -> None:
-    """Excess and success against the time budget."""
-    planners = {"adapt": MetaPlanner.pretrained(name)}
-    planners["adapt without grids"] = MetaPlanner.pretrained(name, grids=False)
-    solvers: dict[tuple[str, float], Solver] = {
-        (label, budget): partial(_planned, planner, deadline(budget))
-        for label, planner in planners.items()
-        for budget in BUDGETS
-    }
-    solvers |= {("eikonal", float(n)): partial(_eikonal, n) for n in NODES}
-    scores: dict[tuple[str, float], Score] = {key: Score() for key in solvers}
-    family = families()[name]
-    for problem in problems(family, seed + 1, CURVE_QUERIES, CURVE_STARTS):
-        for key, solver in solvers.items():
-            _measure(scores[key], problem, solver)
-    rows = [
-        {"method": label, "budget_or_nodes": size, **scores[label, size].figures()}
-        for label, size in scores
-    ]
-    report.figures[f"{name} curve"] = rows
-    table = Table(title=f"{name}: {CURVE_QUERIES} queries x {CURVE_STARTS} starts, against time")
-    for column in ("method", "budget or nodes", "median ms", "reached", "aggregate", "95 %"):
-        table.add_column(column, justify="left" if column == "method" else "right")
-    for row in rows:
-        table.add_row(
-            row["method"],
-            f"{row['budget_or_nodes']:g}",
-            f"{1e3 * row['reaction_median_s']:.1f}",
-            f"{row['reached']:.1%}",
-            f"{row['aggregate_excess']:.4%}",
-            f"{row['excess_95']:.3%}",
-        )
-    report.tables.append(table)
-    if out is not None:
-        _figure(name, rows, out)
+def shown(figure: float | None, form: str, unit: float = 1.0) -> str:
+    """A figure in a table; a dash where there is none."""
+    return "-" if figure is None else form.format(unit * figure)
 
 
-def _figure(name: str, rows: list[dict[str, Any]], out: Path) -> None:
-    import matplotlib.pyplot as plt
-
-    from sims.pictures.plan_figure import save
-
-    figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
-    markers = {"adapt": "o", "adapt without grids": "^", "eikonal": "s"}
-    for label, marker in markers.items():
-        own = [r for r in rows if r["method"] == label]
-        seconds = [r["reaction_median_s"] * 1e3 for r in own]
-        excess = [100 * max(r["aggregate_excess"], 1e-6) for r in own]
-        axes.loglog(seconds, excess, marker=marker, label=label)
-    axes.set_xlabel("policy ready after (ms, median)")
-    axes.set_ylabel("aggregate excess over the exact cost (%)")
-    axes.set_title(f"{name} family")
-    axes.grid(which="both", alpha=0.3)
-    axes.legend(frameon=False)
-    save(figure, out / f"learning-{name}.png")
-
-
-def _table(title: str, figures: dict[str, dict[str, float]]) -> Table:
+def _table(title: str, figures: dict[str, dict[str, float | None]]) -> Table:
     table = Table(title=title)
     columns = ("method", "reached", "aggregate", "median", "95 %", "largest", "new collisions")
     for column in (*columns, "median ms", "95 % ms"):
@@ -235,13 +199,13 @@ def _table(title: str, figures: dict[str, dict[str, float]]) -> Table:
     for name, row in figures.items():
         table.add_row(
             name,
-            f"{row['reached']:.2%}",
-            f"{row['aggregate_excess']:.3%}",
-            f"{row['median_excess']:.4%}",
-            f"{row['excess_95']:.3%}",
-            f"{row['largest_excess']:.2%}",
-            f"{row['new_collisions']:.2%}",
-            f"{1e3 * row['reaction_median_s']:.1f}",
-            f"{1e3 * row['reaction_95_s']:.1f}",
+            shown(row["reached"], "{:.2%}"),
+            shown(row["aggregate_excess"], "{:.3%}"),
+            shown(row["median_excess"], "{:.4%}"),
+            shown(row["excess_95"], "{:.3%}"),
+            shown(row["largest_excess"], "{:.2%}"),
+            shown(row["new_collisions"], "{:.2%}"),
+            shown(row["reaction_median_s"], "{:.1f}", 1e3),
+            shown(row["reaction_95_s"], "{:.1f}", 1e3),
         )
     return table

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ocp.planning import Answer, OneShot, Planner, Until, trajectories
+from ocp.planning import Answer, OneShot, Planner, Until, never, trajectories
 from ocp.query import Query
 from sims.closed_loop import LoopSettings
 from sims.methods import METHODS
@@ -64,7 +64,7 @@ class Contestant:
         return {"contestant": self.key, "note": self.note, "period": self.period}
 
 
-NEVER = Until(lambda _: False)
+NEVER = never()
 EIGHT = trajectories(8)
 
 
