@@ -1,9 +1,14 @@
-"""The value of regulation to an equilibrium on a grid, by value iteration."""
+"""The value of regulation to an equilibrium on a grid, by value iteration.
+
+It starts from what the linear regulator really costs, where that comes to rest (regulator_loop.py):
+without, interpolation in the narrow valley at the equilibrium makes all of V dear.
+"""
 
 import numpy as np
 
 from ocp.compiled.batch import state_costs
 from ocp.grid import Grid, GridValue
+from ocp.grids.regulator_loop import regulator_costs
 from ocp.grids.value_iteration import iterate_values
 from ocp.query import Query
 from ocp.regulation import RegulatorValue
@@ -46,5 +51,6 @@ def solve_regulation_grid(query: Query, grid: Grid | None = None) -> GridValue:
     # From infinite values the scheme can lock: nodes whose motions end among each other wait for
     # one another for ever. A finite bound lets values fall; where they do not, there is no motion.
     cap = CAP_SECONDS * float(state_costs(query, nodes.reshape(-1, system.n)).max())
-    values = iterate_values(query, grid, np.full(grid.shape, cap), held=held).checked().values
+    bound = np.fmin(cap, regulator_costs(query, grid))
+    values = iterate_values(query, grid, bound, held=held).checked().values
     return GridValue(grid, np.where(values < 0.5 * cap, values, np.inf))

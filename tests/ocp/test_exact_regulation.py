@@ -115,15 +115,27 @@ def test_the_closed_loop_costs_hardly_more_than_the_optimum(swing_up: Trajectory
     assert len(value.expansions) == 1  # it never strayed
 
 
-def test_the_grid_lies_above_the_exact_value_by_at_most_a_third(swing_up: Trajectory) -> None:
-    """Known limit: interpolation makes narrow valleys dear; 16 to 25 % too large was measured."""
-    grid = Grid.of(PENDULUM.system, (61, 81))
-    value = solve_regulation_grid(PENDULUM, grid)
-    for fraction in (0.0, 0.3, 0.6):
-        k = int(fraction * np.argmax(swing_up.cost_to_go < 0.1 * swing_up.cost))
-        ratio = float(value.value(PENDULUM.system.wrap(swing_up.states[k])))
-        ratio /= swing_up.cost_to_go[k]
-        assert 0.97 < ratio < 1.33
+def test_the_grid_lies_above_the_exact_value_by_an_error_of_first_order(
+    swing_up: Trajectory,
+) -> None:
+    """Measured: 5 to 10 % too large at 61 x 81 nodes, 3 to 6 % at 121 x 161.
+
+    Multilinear values of a narrow valley are too large by about V'' h^2 / 8 in a step of about h.
+    """
+    errors = []
+    for shape in ((61, 81), (121, 161)):
+        value = solve_regulation_grid(PENDULUM, Grid.of(PENDULUM.system, shape))
+        row = []
+        for fraction in (0.0, 0.3, 0.6):
+            k = int(fraction * np.argmax(swing_up.cost_to_go < 0.1 * swing_up.cost))
+            grid_value = float(value.value(PENDULUM.system.wrap(swing_up.states[k])))
+            row.append(grid_value / swing_up.cost_to_go[k] - 1)
+        errors.append(row)
+    coarse, fine = np.array(errors)
+    assert (coarse > 0).all()
+    assert (fine > 0).all()
+    assert coarse.max() < 0.12
+    assert (fine < 0.75 * coarse).all()
 
 
 def test_the_eikonal_method_says_why_it_does_not_apply() -> None:
