@@ -45,6 +45,7 @@ def drake_collocation(
     knots: int = 61,
     tolerance: float = 1e-6,
     max_iterations: int = 1000,
+    time_limit: float = np.inf,
 ) -> DrakeMotion:
     """The motion over the guess's horizon that minimises running plus terminal cost.
 
@@ -57,6 +58,7 @@ def drake_collocation(
         knots: of the transcription.
         tolerance: of IPOPT.
         max_iterations: of IPOPT.
+        time_limit: processor seconds of IPOPT.
 
     Raises:
         SolveError: if IPOPT did not converge.
@@ -115,6 +117,8 @@ def drake_collocation(
     solver = IpoptSolver()
     options.SetOption(solver.id(), "tol", tolerance)
     options.SetOption(solver.id(), "max_iter", max_iterations)
+    if time_limit < np.inf:
+        options.SetOption(solver.id(), "max_cpu_time", float(time_limit))
     built = time.perf_counter()
     result = solver.Solve(mathematical, None, options)
     ended = time.perf_counter()
