@@ -87,6 +87,7 @@ class Perceived:
         self._goal, self._body = goal, body
         self._radius, self._growth = radius, growth
         self._known: dict[int, _Known] = {}
+        self._standing: list[Solid] = []
         self.surroundings = Surroundings(len(goal))
 
     @property
@@ -136,6 +137,18 @@ class Perceived:
         velocities = np.array([k.velocity for k in every])
         growths = np.array([self._growth * (time - k.unsteady < STEADY) for k in every])
         self.surroundings.update([k.solid for k in every], velocities, growths)
+        self._standing = [
+            k.solid
+            for k, growth in zip(every, growths, strict=True)
+            if not growth and not k.velocity.any()
+        ]
+
+    def standing(self) -> Surroundings:
+        """What stands, as of the last `refresh`: certain, where what moves is a guess."""
+        d, count = len(self._goal), len(self._standing)
+        still = Surroundings(d)
+        still.update(self._standing, np.zeros((count, d)), np.zeros(count))
+        return still
 
     def clearance(self, position: Array) -> float:
         """Metres from `position` `[d]` to the nearest obstacle known; `FAR` if there is none."""

@@ -48,6 +48,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from planners.blockage import Barrier
 from planners.leg import Leg, along_route
+from planners.leg_clearance import Surroundings
 from planners.perceived import Perceived, Sighting
 from planners.rrtx import RRTX, Cause, Update
 from planners.world import SceneWorld
@@ -495,8 +496,13 @@ class Navigator:
             far = np.linalg.norm(references - p, axis=1)
             chosen = int(np.argmin(np.where(roomy, far, np.inf)))
         else:
-            # Nothing is safe: what keeps farthest from the obstacles, or leads away from them.
-            chosen = int(np.argmax(np.minimum(clear, needed) + 0.1 * np.minimum(ends, stay)))
+            # Nothing is safe: what keeps farthest from the obstacles, or leads away from them. What
+            # moves is a guess that may not come true; what stands is not to be met for its sake.
+            certain = self._clearances(paths, self.perceived.standing())
+            spared = [certain >= needed, certain >= body, np.full(len(paths), True)]
+            allowed = next(keeps for keeps in spared if keeps.any())
+            worth = np.minimum(clear, needed) + 0.1 * np.minimum(ends, stay)
+            chosen = int(np.argmax(np.where(allowed, worth, -np.inf)))
         # While the robot stands, the horizon recedes whatever the rule: it may wait for long.
         self._send(time, state, self._at_rest(references[chosen]), count=False)
         self._stop(reason)
@@ -523,9 +529,11 @@ class Navigator:
             )
         return np.concatenate([told + references[:, None], references[:, None]], axis=1)
 
-    def _clearances(self, paths: Array) -> Array:
+    def _clearances(self, paths: Array, obstacles: Surroundings | None = None) -> Array:
+        """Least clearance `[c]` of motions `[c, k, d]` to `obstacles`, by default all."""
         settings = self.settings
-        return self.perceived.surroundings.clearances(
+        asked = self.perceived.surroundings if obstacles is None else obstacles
+        return asked.clearances(
             paths, settings.sample_period, settings.foresight, settings.least_padding + 1.0
         )
 

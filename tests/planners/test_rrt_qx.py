@@ -255,6 +255,26 @@ def test_a_disc_that_walks_into_the_way_is_let_pass():
     assert least >= 0.05
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_what_stands_is_not_met_to_make_way_for_what_moves(seed):
+    """A disc too broad and too fast to escape drives through a yard of posts: it may hit the robot,
+    but the robot, which knows where the posts are, hits none of them."""
+    rng = np.random.default_rng(seed)
+    turns = rng.uniform(0.0, 2 * np.pi) + np.arange(7) * (2 * np.pi / 7)
+    places = np.array(START) + 1.6 * np.column_stack([np.cos(turns), np.sin(turns)])
+    posts = [Solid.ball(place, 0.5) for place in places]
+    world = World(FLOWING, posts)
+    world.go(0.5)
+    course = rng.uniform(0.0, 2 * np.pi)
+    way = np.array([np.cos(course), np.sin(course)])
+    disc = Solid.ball(np.array(START) - 6.0 * way, 2.5)
+    for _ in range(80):
+        disc = disc.moved(3.0 * PERIOD * way)
+        world.solids[len(posts)] = disc
+        world.go(PERIOD)
+        assert min(world.away()[k] for k in range(len(posts))) >= 0.2
+
+
 def test_rules_that_foretell_refuse_a_controller_that_cannot():
     world = World(FLOWING, glider=Glider(tells=False))
     with pytest.raises(ValueError, match="forecast"):
