@@ -138,7 +138,7 @@ def _refining(key: str, most: int) -> Callable:
         state = planner.start(query, starts)
         spent = time.process_time() - begun
         yield spent, planner.policy(state)
-        for k in range(most // (4 if quick else 1)):
+        for k in range(most // (8 if quick else 1)):
             if state.finished:
                 return
             begun = time.process_time()

@@ -34,7 +34,7 @@ WORKERS = (1, 2, 4)
 def run(setting: Setting, parts: Parts) -> Findings:
     """All four panels."""
     quick = setting.quick
-    queries, starts = (3, 8) if quick else (20, 32)
+    queries, starts = (2, 8) if quick else (20, 32)
     counts = (0, 2, 8, 16) if quick else (0, 1, 2, 4, 8, 16, 32, 64)
     largest = 16 if quick else 64
     config = {"starts": starts, "counts": list(counts)}
