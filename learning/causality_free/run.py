@@ -58,11 +58,11 @@ def run(settings: TrainingSettings, folder: Path, door: Door, command: str) -> P
     torch.set_num_threads(1)  # its matrices are too small for more to pay
     checkpoint = folder / "checkpoint.pt"
     if checkpoint.exists():
-        state = training.load_checkpoint(checkpoint, settings)
+        state = training.restored(checkpoint, settings)
     else:
         state = training.start(settings)
     for state in training.train(settings, state, gather_through(door)):  # noqa: B020
-        training.save_checkpoint(checkpoint, settings, state)
+        training.save(checkpoint, settings, state)
         write_text(folder / "curve.json", json.dumps({"columns": CURVE, "rows": state.curve}))
         step, seconds, wrong, excess, median, value = state.curve[-1]
         log.info(

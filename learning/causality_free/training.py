@@ -10,8 +10,8 @@ Seeded, and resumable to the bit: samples of a step depend on seed and step alon
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,8 @@ from learning.causality_free.network import Weights, fresh_weights
 from learning.causality_free.residual import largest
 from learning.causality_free.samples import Samples, batch_of, resting_inputs
 from learning.causality_free.value import NetworkValue, embed
-from ocp.files import atomic_path
+from learning.checkpoint import load_checkpoint, save_checkpoint
+from learning.settings import from_table
 from ocp.query import Query
 from ocp.query_file import read_toml
 from ocp.regulation import RegulatorValue
@@ -99,39 +100,12 @@ class TrainingSettings:
         table = read_toml(path)
         if table.pop("kind", None) != KIND:
             raise ValueError(f"{path}: kind: must be {KIND!r}")
-        if "loss" in table:
-            table["loss"] = LossWeights(**_checked(LossWeights, table["loss"], "loss."))
-        return cls(**_checked(cls, table, ""))
+        return from_table(cls, table)
 
     @property
     def total_steps(self) -> int:
         """Of all rounds."""
         return sum(self.steps)
-
-
-def _checked(kind: Any, table: Any, prefix: str) -> dict[str, Any]:
-    """A table's entries as arguments of a dataclass; unknown, missing and ill-typed are refused."""
-    if not isinstance(table, Mapping):
-        raise ValueError(f"{prefix or 'settings'}: must be a table, got {table!r}")
-    known = {f.name: f for f in fields(kind)}
-    found: dict[str, Any] = {}
-    for key, value in table.items():
-        if key not in known:
-            raise ValueError(f"{prefix}{key}: unknown; known are {', '.join(known)}")
-        wanted = known[key].type
-        if wanted == tuple[int, ...]:
-            if not (isinstance(value, list) and all(type(x) is int for x in value)):
-                raise ValueError(f"{prefix}{key}: must be a list of integers, got {value!r}")
-            value = tuple(value)
-        elif wanted is int and type(value) is not int:
-            raise ValueError(f"{prefix}{key}: must be an integer, got {value!r}")
-        elif wanted is float and type(value) not in (int, float):
-            raise ValueError(f"{prefix}{key}: must be a number, got {value!r}")
-        found[key] = value
-    for key, f in known.items():
-        if key not in table and f.default is MISSING and f.default_factory is MISSING:
-            raise ValueError(f"{prefix}{key}: missing")
-    return found
 
 
 @dataclass(frozen=True)
@@ -300,36 +274,29 @@ def _errors(weights: Weights, batch: Any, resting: Tensor, scale: Tensor) -> tup
         return errors(weights, batch, resting, scale)
 
 
-def save_checkpoint(path: Path, settings: TrainingSettings, state: TrainingState) -> None:
+def save(path: Path, settings: TrainingSettings, state: TrainingState) -> None:
     """Everything that a run needs to go on, written whole or not at all."""
-    rounds = [
-        [[torch.from_numpy(getattr(s, f.name)) for f in fields(Samples)] for s in samples]
-        for samples in state.rounds
-    ]
-    with atomic_path(path) as temporary:
-        torch.save(
-            {
-                "settings": asdict(settings),
-                "step": state.step,
-                "weights": {n: t.detach() for n, t in state.weights.tensors().items()},
-                "optimiser": state.optimiser.state_dict(),
-                "rounds": rounds,
-                "curve": state.curve,
-                "seconds": state.seconds,
-            },
-            temporary,
-        )
+    record = {
+        "step": state.step,
+        "weights": {n: t.detach() for n, t in state.weights.tensors().items()},
+        "optimiser": state.optimiser.state_dict(),
+        "rounds": [
+            [[torch.from_numpy(getattr(s, f.name)) for f in fields(Samples)] for s in samples]
+            for samples in state.rounds
+        ],
+        "curve": state.curve,
+        "seconds": state.seconds,
+    }
+    save_checkpoint(path, settings, record)
 
 
-def load_checkpoint(path: Path, settings: TrainingSettings) -> TrainingState:
-    """The state that `save_checkpoint` wrote.
+def restored(path: Path, settings: TrainingSettings) -> TrainingState:
+    """The state that `save` wrote.
 
     Raises:
         ValueError: if it belongs to other settings.
     """
-    record: dict[str, Any] = torch.load(path, weights_only=True)
-    if record["settings"] != asdict(settings):
-        raise ValueError(f"{path}: the checkpoint belongs to a run with other settings")
+    record = load_checkpoint(path, settings)
     weights = Weights.of(record["weights"])
     optimiser = _optimiser(weights)
     optimiser.load_state_dict(record["optimiser"])

@@ -10,17 +10,17 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
+from learning.checkpoint import load_checkpoint, save_checkpoint
 from learning.conditioned.training_data import FamilyTensors
 from learning.conditioned.value_function import ConditionedNetwork, Widths, value_and_slopes
 from learning.conditioned.value_samples import SampleSizes
-from ocp.files import atomic_path
+from learning.settings import from_table
 from ocp.query_file import read_toml
 
 KIND = "conditioned"
@@ -77,29 +77,7 @@ class TrainingSettings:
         table = read_toml(path)
         if table.pop("kind", None) != KIND:
             raise ValueError(f"{path}: kind: must be {KIND!r}")
-        nested = {"data": SampleSizes, "widths": Widths}
-        arguments = {
-            name: _filled(nested[name], value, f"{name}.") if name in nested else value
-            for name, value in table.items()
-        }
-        return _filled(cls, arguments, "")
-
-
-def _filled(kind: Any, table: Any, prefix: str) -> Any:
-    """An instance of a dataclass from a table; unknown and missing keys are refused."""
-    if not isinstance(table, dict):
-        raise ValueError(f"{prefix}: must be a table, got {table!r}")
-    known = {f.name: f for f in fields(kind)}
-    for key, value in table.items():
-        if key not in known:
-            raise ValueError(f"{prefix}{key}: unknown; known are {', '.join(known)}")
-        wanted = known[key].type
-        if wanted is int and (not isinstance(value, int) or isinstance(value, bool)):
-            raise ValueError(f"{prefix}{key}: must be an integer, got {value!r}")
-    for key, f in known.items():
-        if key not in table and f.default is MISSING and f.default_factory is MISSING:
-            raise ValueError(f"{prefix}{key}: missing")
-    return kind(**table)
+        return from_table(cls, table)
 
 
 @dataclass
@@ -197,31 +175,25 @@ def train(
             yield state
 
 
-def save_checkpoint(path: Path, settings: TrainingSettings, state: TrainingState) -> None:
+def save(path: Path, settings: TrainingSettings, state: TrainingState) -> None:
     """Everything that a run needs to go on, written whole or not at all."""
-    with atomic_path(path) as temporary:
-        torch.save(
-            {
-                "settings": asdict(settings),
-                "step": state.step,
-                "network": state.network.state_dict(),
-                "optimiser": state.optimiser.state_dict(),
-                "curve": state.curve,
-                "seconds": state.seconds,
-            },
-            temporary,
-        )
+    record = {
+        "step": state.step,
+        "network": state.network.state_dict(),
+        "optimiser": state.optimiser.state_dict(),
+        "curve": state.curve,
+        "seconds": state.seconds,
+    }
+    save_checkpoint(path, settings, record)
 
 
-def load_checkpoint(path: Path, settings: TrainingSettings) -> TrainingState:
-    """The state that `save_checkpoint` wrote.
+def restored(path: Path, settings: TrainingSettings) -> TrainingState:
+    """The state that `save` wrote.
 
     Raises:
         ValueError: if it belongs to other settings.
     """
-    record: dict[str, Any] = torch.load(path, weights_only=True)
-    if record["settings"] != asdict(settings):
-        raise ValueError(f"{path}: the checkpoint belongs to a run with other settings")
+    record = load_checkpoint(path, settings)
     network = ConditionedNetwork(settings.widths)
     network.load_state_dict(record["network"])
     optimiser = torch.optim.Adam(network.parameters())

@@ -94,13 +94,13 @@ def run(settings: TrainingSettings, folder: Path, door: Door, command: str) -> P
     """
     torch.set_num_threads(1)  # its matrices are too small for more to pay
     checkpoint = folder / "checkpoint.pt"
-    resumed = training.load_checkpoint(checkpoint, settings) if checkpoint.exists() else None
+    resumed = training.restored(checkpoint, settings) if checkpoint.exists() else None
     samples = sampled(settings, folder, door)
     known = family_tensors(samples[: -settings.held_out])
     held_out = family_tensors(samples[-settings.held_out :])
     state = resumed or training.start(settings, known)
     for state in training.train(settings, state, known, held_out):  # noqa: B020
-        training.save_checkpoint(checkpoint, settings, state)
+        training.save(checkpoint, settings, state)
         write_curve(folder / "curve.json", state)
         step, seconds, direction, value, out_direction, out_value = state.curve[-1]
         left = seconds / step * (settings.steps - step)

@@ -1,17 +1,15 @@
-"""Configuration of meta value learning, read from TOML: every parameter of section IV-B by name.
-
-Unknown keys are refused, so that a misspelt parameter cannot silently keep its default.
-"""
+"""Configuration of meta value learning, read from TOML: every parameter of section IV-B by name."""
 
 import os
 import tomllib
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 from learning.faithful.losses import Derivative, Lagrangian, Reduction, Structure
 from learning.faithful.value_network import Activation
+from learning.settings import from_table, word_of
 from ocp.query_family import PAPER_FAMILY, QueryFamily
 from ocp.set_valued import COARSE, Image
 
@@ -246,62 +244,16 @@ class Config:
         kind = table.pop("kind", None)
         if kind != KIND:
             raise ValueError(f'kind: must be "{KIND}", got {kind!r}')
-        return _read(cls, table, "")
+        return from_table(cls, table)
 
     def table(self) -> dict[str, Any]:
         """What `from_table` reads."""
         return {"kind": KIND} | _plain(asdict(self))
 
 
-def _read(cls: type, table: dict[str, Any], owner: str) -> Any:
-    """A dataclass from a TOML table."""
-    hints = get_type_hints(cls)
-    known = {f.name: f for f in fields(cls)}
-    for name in table:
-        if name not in known:
-            raise ValueError(f"{owner}{name}: unknown; known are {', '.join(known)}")
-    found = {}
-    for name, value in table.items():
-        found[name] = _converted(hints[name], value, f"{owner}{name}")
-    missing = [n for n, f in known.items() if n not in table and f.default is MISSING]
-    if missing:
-        raise ValueError(f"{owner}{missing[0]}: missing")
-    return cls(**found)
-
-
-def _converted(kind: Any, value: Any, field: str) -> Any:
-    if is_dataclass(kind):
-        if not isinstance(value, dict):
-            raise ValueError(f"{field}: must be a table, got {value!r}")
-        return _read(kind, value, f"{field}.")  # pyright: ignore[reportArgumentType]
-    if isinstance(kind, type) and issubclass(kind, Enum):
-        names = _names(kind)
-        if value not in names:
-            raise ValueError(f"{field}: must be one of {', '.join(names)}, got {value!r}")
-        return names[value]
-    if kind == tuple[int, ...]:
-        if not isinstance(value, list) or not all(type(x) is int and x > 0 for x in value):
-            raise ValueError(f"{field}: must be a list of positive whole numbers, got {value!r}")
-        return tuple(value)
-    if kind is float and type(value) is int:
-        return float(value)
-    if type(value) is not kind:
-        raise ValueError(f"{field}: must be a {kind.__name__}, got {value!r}")
-    return value
-
-
-def _names(kind: type[Enum]) -> dict[str, Enum]:
-    """The words that a file uses for an enum's members."""
-    if kind is Image:  # its values are sentences
-        return {member.name.lower(): member for member in Image}
-    return {member.value: member for member in kind}
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, Image):
-        return value.name.lower()
     if isinstance(value, Enum):
-        return value.value
+        return word_of(value)
     return list(value) if isinstance(value, tuple) else value

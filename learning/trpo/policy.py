@@ -6,7 +6,7 @@ reinforcement learning; training does (training.py, the extra `rl`).
 """
 
 import os
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from learning.settings import from_table
 from learning.shipped import PRETRAINED
 from learning.trpo.robot_batch import Array, Encoder, EnvironmentSettings, scaled
 from learning.weights import load_tensors, save_tensors
@@ -85,32 +86,7 @@ class TrpoSettings:
         table = read_toml(path)
         if table.pop("kind", None) != KIND:
             raise ValueError(f"{path}: kind: must be {KIND!r}")
-        return cls.of_table(table)
-
-    @classmethod
-    def of_table(cls, table: dict[str, Any]) -> "TrpoSettings":
-        """From a table such as `asdict` makes; unknown keys are refused."""
-        table = dict(table)
-        if "hidden" in table:
-            table["hidden"] = tuple(table["hidden"])
-        if "environment" in table:
-            table["environment"] = _filled(
-                EnvironmentSettings, table["environment"], "environment."
-            )
-        return _filled(cls, table, "")
-
-
-def _filled(kind: type, table: dict[str, Any], prefix: str) -> Any:
-    known = {f.name: f.default for f in fields(kind)}
-    for name, value in table.items():
-        if name not in known:
-            raise ValueError(f"{prefix}{name}: unknown; known are {', '.join(known)}")
-        number = isinstance(known[name], (int, float))
-        if number and (isinstance(value, bool) or not isinstance(value, (int, float))):
-            raise ValueError(f"{prefix}{name}: must be a number, got {value!r}")
-        if isinstance(known[name], int) and not isinstance(value, int):
-            raise ValueError(f"{prefix}{name}: must be a whole number, got {value!r}")
-    return kind(**table)
+        return from_table(cls, table)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +131,7 @@ class TrpoWeights:
         tensors, record = load_tensors(path)
         if record.pop("kind", None) != KIND:
             raise ValueError(f"{path}: holds no policy trained by TRPO")
-        settings = TrpoSettings.of_table(record.pop("settings"))
+        settings = from_table(TrpoSettings, record.pop("settings"))
         layers = []
         for k in range(len(settings.hidden) + 1):
             names = f"{k}.matrix", f"{k}.bias"

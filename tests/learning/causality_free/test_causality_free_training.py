@@ -20,8 +20,8 @@ from learning.causality_free.training import (
     TrainingState,
     family_query,
     gather_here,
-    load_checkpoint,
-    save_checkpoint,
+    restored,
+    save,
     start,
     train,
 )
@@ -85,17 +85,17 @@ def test_a_resumed_run_equals_an_uninterrupted_one(finished, tmp_path) -> None:
         for reached in train(SMALL, state):
             if reached.step == stop:
                 break
-        save_checkpoint(tmp_path / "c.pt", SMALL, state)
-        state = load_checkpoint(tmp_path / "c.pt", SMALL)
+        save(tmp_path / "c.pt", SMALL, state)
+        state = restored(tmp_path / "c.pt", SMALL)
         assert state.step == stop
     _to_the_end(state)
     assert all(torch.equal(a, b) for a, b in zip(tensors(state), tensors(finished), strict=True))
 
 
 def test_a_checkpoint_of_other_settings_is_refused(finished, tmp_path) -> None:
-    save_checkpoint(tmp_path / "c.pt", SMALL, finished)
+    save(tmp_path / "c.pt", SMALL, finished)
     with pytest.raises(ValueError, match="other settings"):
-        load_checkpoint(tmp_path / "c.pt", replace(SMALL, seed=1))
+        restored(tmp_path / "c.pt", replace(SMALL, seed=1))
 
 
 def test_a_run_in_a_folder_ships_its_weights(tmp_path) -> None:

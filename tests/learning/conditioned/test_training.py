@@ -137,10 +137,10 @@ def test_a_resumed_run_ends_with_the_same_weights(tensors, tmp_path):
     path = tmp_path / "checkpoint.pt"
     stopped = training.start(SETTINGS, known)
     for stopped in training.train(SETTINGS, stopped, known, held_out):  # noqa: B020
-        training.save_checkpoint(path, SETTINGS, stopped)
+        training.save(path, SETTINGS, stopped)
         break
     assert stopped.step == 20
-    resumed = training.load_checkpoint(path, SETTINGS)
+    resumed = training.restored(path, SETTINGS)
     *_, resumed = training.train(SETTINGS, resumed, known, held_out)
     for name, tensor in whole.network.state_dict().items():
         assert torch.equal(tensor, resumed.network.state_dict()[name]), name
@@ -151,9 +151,9 @@ def test_a_resumed_run_ends_with_the_same_weights(tensors, tmp_path):
 def test_a_checkpoint_of_other_settings_is_refused(tensors, tmp_path):
     known, _ = tensors
     path = tmp_path / "checkpoint.pt"
-    training.save_checkpoint(path, SETTINGS, training.start(SETTINGS, known))
+    training.save(path, SETTINGS, training.start(SETTINGS, known))
     with pytest.raises(ValueError, match="other settings"):
-        training.load_checkpoint(path, replace(SETTINGS, seed=1))
+        training.restored(path, replace(SETTINGS, seed=1))
 
 
 def test_a_run_leaves_weights_with_their_provenance(tmp_path):
@@ -176,7 +176,7 @@ def test_a_run_leaves_weights_with_their_provenance(tmp_path):
         ('kind = "other"', "kind"),
         ("stepz = 3", "stepz: unknown"),
         ("steps = 0", "steps: must be at least 1"),
-        ("batch = 1.5", "batch: must be an integer"),
+        ("batch = 1.5", "batch: must be a whole number"),
     ],
 )
 def test_bad_configurations_are_refused(tmp_path, line, message):

@@ -52,7 +52,7 @@ BAD = [
     (("sead",), 1, "sead: unknown"),
     (("meta", "iteration"), 5, r"meta\.iteration: unknown"),
     (("meta", "iterations"), 0, r"meta\.iterations: must be a positive"),
-    (("meta", "iterations"), 2.5, r"meta\.iterations: must be a int"),
+    (("meta", "iterations"), 2.5, r"meta\.iterations: must be a whole number"),
     (("meta", "inner_rate"), -1.0, r"meta\.inner_rate"),
     (("meta", "inner_steps"), -1, r"meta\.inner_steps"),
     (("network", "activation"), "tanh", r"network\.activation: must be one of relu, silu"),

@@ -94,7 +94,7 @@ def test_the_value_is_what_the_closed_loop_costs() -> None:
         ('kind = "meta"', "kind"),
         ('kind = "trpo"\nstep = 3', "step: unknown"),
         ('kind = "trpo"\nsteps = 0', "steps: must be at least 1"),
-        ('kind = "trpo"\nsteps = "many"', "steps: must be a number"),
+        ('kind = "trpo"\nsteps = "many"', "steps: must be a whole number"),
         ('kind = "trpo"\ndiscount = 1.5', "discount: must lie in"),
         ('kind = "trpo"\nhidden = []', "hidden"),
         ('kind = "trpo"\n[environment]\nstep = -1', "step: must be a positive"),
