@@ -4,7 +4,6 @@ Beside `causality-free-NAME.safetensors` stands a TOML file of the same name, th
 settings, seed, hash of the data, version of the code, the command, and the figures measured.
 """
 
-import hashlib
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from learning.causality_free.families import (
 )
 from learning.causality_free.network import Weights
 from learning.causality_free.value import NetworkValue
-from learning.shipped import PRETRAINED
+from learning.shipped import PRETRAINED, file_hash
 from learning.weights import load_tensors, save_tensors
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status
@@ -85,8 +84,7 @@ class Pretrained:
         tensors, record = load_tensors(path)
         beside = path.with_suffix(".toml")
         told = tomllib.loads(beside.read_text(encoding="utf-8")) if beside.is_file() else {}
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        if told and told["weights_sha256"] != digest:
+        if told and told["weights_sha256"] != file_hash(path):
             raise ValueError(f"{path.name}: damaged: its hash is not the one in {beside.name}")
         reference, lower, upper = (np.array(record[k]) for k in ("reference", "lower", "upper"))
         family, weights = get_family(record["family"]), Weights.of(tensors)

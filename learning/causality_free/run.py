@@ -19,6 +19,7 @@ from learning.causality_free.families import get_family
 from learning.causality_free.pretrained import Pretrained
 from learning.causality_free.samples import POINTS, Samples
 from learning.causality_free.training import GatherTask, TrainingSettings, TrainingState
+from learning.shipped import file_hash
 from ocp.execution import Door, completed
 from ocp.files import write_text
 from ocp.version import code_version
@@ -78,7 +79,7 @@ def run(settings: TrainingSettings, folder: Path, door: Door, command: str) -> P
     Pretrained.of(family, state.weights, queries).save(path)
     provenance = {
         "command": command,
-        "weights_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "weights_sha256": file_hash(path),
         "data_sha256": digest(state),
         "motions": sum(len(s) for samples in state.rounds for s in samples) // POINTS,
         "code_of_ocp": code_version(),

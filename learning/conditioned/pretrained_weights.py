@@ -4,7 +4,6 @@ Beside `NAME.safetensors` stands `NAME.toml`, the provenance: settings, seeds, h
 version of the code, the command, and the figures measured.
 """
 
-import hashlib
 import tomllib
 from dataclasses import dataclass
 from functools import cache
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from learning.conditioned.network_weights import NetworkWeights
-from learning.shipped import PRETRAINED
+from learning.shipped import PRETRAINED, file_hash
 from ocp.query import Goal, Query
 from ocp.query_family import PAPER_FAMILY, paper_query
 
@@ -73,8 +72,3 @@ def read_pretrained(path: Path) -> Pretrained:
     if file_hash(path) != provenance["weights_sha256"]:
         raise ValueError(f"{path.name}: damaged: its hash is not the one in {path.stem}.toml")
     return Pretrained(NetworkWeights.load(path), provenance["worth_nodes"], provenance)
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -17,10 +17,10 @@ import torch
 
 from learning.conditioned import training
 from learning.conditioned.network_weights import NetworkWeights
-from learning.conditioned.pretrained_weights import file_hash
 from learning.conditioned.training import TrainingSettings, TrainingState
 from learning.conditioned.training_data import family_tensors
 from learning.conditioned.value_samples import SampleTask, ValueSamples, digest, sample_query
+from learning.shipped import file_hash
 from ocp.execution import Door, completed
 from ocp.files import atomic_path, write_text
 from ocp.query import Query

@@ -98,9 +98,7 @@ def _loops(functions, q, P, centre, period, box, inputs, step, most, nodes, cost
                 costs[row] = spent + left
                 break
             z[:n] = x
-            optimal_input(
-                z, q, xu[n:]
-            )  # held for the step: so it is a motion that the robot can do
+            optimal_input(z, q, xu[n:])  # held for the step: a motion that the robot can do
             inside = True
             for stage in range(4):
                 ahead = 0.0 if stage == 0 else (step if stage == 3 else 0.5 * step)

@@ -242,7 +242,7 @@ def _table(title: str) -> Table:
         "way/straight",
         "clearance least / median, m",
         "D_kin, m",
-        "latency ms 50 / 99 %",
+        "latency ms 50 / 99 % / worst",
         "missed",
         "cost excess, worst",
     ):
@@ -281,7 +281,8 @@ def _row(table: Table, label: str, robots: Sequence[dict[str, Any]]) -> None:
         mean("detour"),
         f"{min(clear):.3f} / {np.median(clear):.3f}" if clear else "-",
         mean("deviation"),
-        f"{np.median(latency[:, 0]) * 1e3:.1f} / {np.median(latency[:, 1]) * 1e3:.1f}",
+        f"{np.median(latency[:, 0]) * 1e3:.1f} / {np.median(latency[:, 1]) * 1e3:.1f} / "
+        f"{latency[:, 2].max() * 1e3:.0f}",
         f"{missed} of {samples}",
         f"{max(excess):.1e}" if excess else "-",
     )
