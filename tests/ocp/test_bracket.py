@@ -68,8 +68,10 @@ def test_a_finer_grid_brings_a_better_bound() -> None:
     query, rng = paper_query((1.0, 1.0)), np.random.default_rng(7)
     states = np.array([sample_start(query, rng) for _ in range(200)])
     coarse = lower_bound(query, nodes=8_000, factor=2).value(states)
-    fine = lower_bound(query, nodes=60_000, factor=3).value(states)
+    bound = lower_bound(query, nodes=60_000, factor=3)
+    fine = bound.value(states)
     assert coarse.mean() < fine.mean()
+    assert 0.9 * TABLE_ONE_OPTIMA[1.0, 1.0] < bound.value(PAPER_START) <= TABLE_ONE_OPTIMA[1.0, 1.0]
 
 
 def test_the_radial_bound_is_the_closed_form_from_below() -> None:
