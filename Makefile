@@ -13,7 +13,7 @@ demo: .venv/installed
 	$(BIN)/zermelo demo four-queries --out out/demo
 
 test: .venv/installed
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
 notebooks: .venv/installed
 	$(BIN)/python -m pytest --numprocesses 2 -m notebook
