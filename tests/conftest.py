@@ -22,8 +22,11 @@ settings.load_profile("reproducible")
 
 
 def pytest_configure() -> None:
-    """On a fresh machine workers would compile the same functions side by side: let every second one
-    begin with the last module, so that each finds compiled what the other has done."""
+    """Let every second worker begin with the last module.
+
+    On a fresh machine workers would compile the same functions side by side; so each finds compiled
+    what the other has done.
+    """
     worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
     if int(worker.removeprefix("gw")) % 2:
         root = Path(__file__).resolve().parent.parent

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from learning.checkpoint import load_checkpoint, save_checkpoint
+from learning.conditioned.data_parallel import ALONE, Crew
 from learning.conditioned.training_data import FamilyTensors
 from learning.conditioned.value_function import ConditionedNetwork, Widths, value_and_slopes
 from learning.conditioned.value_samples import SampleSizes
@@ -140,11 +141,12 @@ def train(
     data: FamilyTensors,
     held_out: FamilyTensors,
     until: Callable[[TrainingState], bool] = lambda _: False,
+    crew: Crew = ALONE,
 ) -> Iterator[TrainingState]:
     """Train on, yielding the state after every `checkpoint_steps` and at the end.
 
     Each step's samples depend on seed and step only, so a run that was stopped goes on to the same
-    weights.
+    weights, and the processes of a crew need not tell one another what they draw.
     """
     begun = time.perf_counter() - state.seconds
     sums = np.zeros(2)
@@ -155,13 +157,23 @@ def train(
         mirrored = rng.random(settings.batch) < 0.5
         for group in state.optimiser.param_groups:
             group["lr"] = rate_at(settings, state.step)
-        direction, value = loss_parts(state.network, data, rows, mirrored)
+        mine = crew.part()
+        direction, value = loss_parts(state.network, data, rows[mine], mirrored[mine])
+        # Means over this process's part, weighted so that they add up to the batch's.
+        smooth = data.smooth[torch.from_numpy(rows)]
+        parts = torch.stack(
+            [
+                direction * (smooth[mine].sum() / smooth.sum().clamp(min=1)),
+                value * (len(rows[mine]) / len(rows)),
+            ]
+        )
         state.optimiser.zero_grad(set_to_none=True)
-        (direction + settings.value_weight * value).backward()
+        (parts[0] + settings.value_weight * parts[1]).backward()
+        crew.sum_gradients(state.network)
         torch.nn.utils.clip_grad_norm_(state.network.parameters(), 1.0)
         state.optimiser.step()
         state.step += 1
-        sums += [direction.item(), value.item()]
+        sums += crew.summed(parts.detach()).numpy()
         since += 1
         if state.step % settings.checkpoint_steps == 0 or state.step == settings.steps:
             state.seconds = time.perf_counter() - begun

@@ -16,6 +16,7 @@ import tomli_w
 import torch
 
 from learning.conditioned import training
+from learning.conditioned.data_parallel import ALONE, Crew
 from learning.conditioned.network_weights import NetworkWeights
 from learning.conditioned.training import TrainingSettings, TrainingState
 from learning.conditioned.training_data import family_tensors
@@ -82,8 +83,12 @@ def _read(path: Path) -> Samples:
     return [(query_from_dict(q), ValueSamples(*p)) for q, p in zip(queries, parts, strict=True)]
 
 
-def run(settings: TrainingSettings, folder: Path, door: Door, command: str) -> Path:
+def run(
+    settings: TrainingSettings, folder: Path, door: Door, command: str, crew: Crew = ALONE
+) -> Path:
     """Train to the end, from the checkpoint in the folder if there is one.
+
+    Of a crew the leader samples and writes; all must see the same folder.
 
     Returns:
         The weights' path; `weights.toml` beside it says where they come from.
@@ -95,11 +100,17 @@ def run(settings: TrainingSettings, folder: Path, door: Door, command: str) -> P
     torch.set_num_threads(1)  # its matrices are too small for more to pay
     checkpoint = folder / "checkpoint.pt"
     resumed = training.restored(checkpoint, settings) if checkpoint.exists() else None
+    if not crew.leads:
+        crew.wait()
     samples = sampled(settings, folder, door)
+    if crew.leads:
+        crew.wait()
     known = family_tensors(samples[: -settings.held_out])
     held_out = family_tensors(samples[-settings.held_out :])
     state = resumed or training.start(settings, known)
-    for state in training.train(settings, state, known, held_out):  # noqa: B020
+    for state in training.train(settings, state, known, held_out, crew=crew):  # noqa: B020
+        if not crew.leads:
+            continue
         training.save(checkpoint, settings, state)
         write_curve(folder / "curve.json", state)
         step, seconds, direction, value, out_direction, out_value = state.curve[-1]
@@ -109,6 +120,9 @@ def run(settings: TrainingSettings, folder: Path, door: Door, command: str) -> P
             *(step, settings.steps, direction, value, out_direction, out_value, left / 60),
         )
     path = folder / "weights.safetensors"
+    crew.wait()
+    if not crew.leads:
+        return path
     arrays = {name: tensor.numpy() for name, tensor in state.network.state_dict().items()}
     NetworkWeights(arrays).save(path)
     provenance = {
@@ -117,6 +131,7 @@ def run(settings: TrainingSettings, folder: Path, door: Door, command: str) -> P
         "data_sha256": digest(samples),
         "code_of_ocp": code_version(),
         "code_of_learning": _own_version(),
+        "processes": crew.size,
         "worth_nodes": UNMEASURED_NODES,
         "settings": asdict(settings),
         "held_out": dict(zip(CURVE, state.curve[-1], strict=True)),

@@ -1,6 +1,7 @@
 """`zermelo train`: make the shipped weights again, or others; resumable, with a training curve."""
 
 import json
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from ocp.query_file import read_toml
 from sims.exit_status import BadInputError, reading_input
 
 if TYPE_CHECKING:
+    from learning.conditioned.data_parallel import Crew
     from sims import cli
 
 notes = Console(stderr=True)
@@ -21,7 +23,17 @@ EXACT_PRELOAD = ("learning.causality_free.training",)
 
 
 def run(command: "cli.Train") -> int:
-    """Run the command; returns its exit status."""
+    """Run the command, on all processes that torch's launcher started; returns its exit status."""
+    from learning.conditioned.data_parallel import launched
+
+    with launched() as crew:
+        if not crew.leads:
+            notes.quiet = True
+            logging.getLogger().setLevel(logging.WARNING)
+        return _run(command, crew)
+
+
+def _run(command: "cli.Train", crew: "Crew") -> int:
     from learning.causality_free import training as causality_free
     from learning.conditioned import training
     from learning.faithful import config as faithful
@@ -45,19 +57,27 @@ def run(command: "cli.Train") -> int:
                 kinds_known = (training.KIND, faithful.KIND, trpo.KIND, causality_free.KIND)
                 known = ", ".join(kinds_known)
                 raise ValueError(f"{path}: kind: {kind!r} is unknown; known are {known}")
+            if crew.size > 1 and kind != training.KIND:
+                raise ValueError(
+                    f"{path}: kind: only {training.KIND!r} trains on several processes, "
+                    f"got {kind!r}"
+                )
     document = []
     for path, one in zip(paths, settings, strict=True):
         folder = (command.out or Path("training")) / path.stem
         folder.mkdir(parents=True, exist_ok=True)
         notes.print(f"training {path.stem} in {folder}; run the command again to go on")
-        document.append(_train(one, path, folder, command))
-        figure(folder / "curve.json", folder / "curve.png")
-    if command.json:
+        document.append(_train(one, path, folder, command, crew))
+        if crew.leads:
+            figure(folder / "curve.json", folder / "curve.png")
+    if command.json and crew.leads:
         print(json.dumps(document))
     return 0
 
 
-def _train(settings: Any, path: Path, folder: Path, command: "cli.Train") -> dict[str, Any]:
+def _train(
+    settings: Any, path: Path, folder: Path, command: "cli.Train", crew: "Crew"
+) -> dict[str, Any]:
     from learning.causality_free.training import TrainingSettings as CausalityFreeSettings
     from learning.conditioned.training import TrainingSettings
     from learning.trpo.policy import TrpoSettings
@@ -73,7 +93,7 @@ def _train(settings: Any, path: Path, folder: Path, command: "cli.Train") -> dic
 
         how = f"zermelo train {path.parent.name}/{path.name}"
         with reading_input(), open_door(command.workers, command.cluster, PRELOAD) as door:
-            weights = train(settings, folder, door, how)
+            weights = train(settings, folder, door, how, crew)
     elif isinstance(settings, TrpoSettings):
         try:
             from learning.trpo.training import train as train_trpo
