@@ -5,8 +5,13 @@ than it saves, and ten times more where a neighbour keeps the other core busy.
 """
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from threading import TIMEOUT_MAX
+from typing import TypeVar
+
+Answer = TypeVar("Answer")
 
 THREAD_LIMITS = (
     "OMP_NUM_THREADS",
@@ -36,3 +41,16 @@ def usable_cores() -> int:
 def warm_workers() -> ThreadPoolExecutor:
     """Threads for compiled work beside the caller's: one for each further core, at least one."""
     return ThreadPoolExecutor(max(1, usable_cores() - 1), thread_name_prefix="zermelo")
+
+
+def in_time(work: Callable[[], Answer], seconds: float) -> Answer | None:
+    """The answer of `work`, done on another core; `None` if it is not there after `seconds`.
+
+    Work that is late goes on unheeded: it must change nothing but its answer.
+    """
+    future = warm_workers().submit(work)
+    try:
+        return future.result(min(max(0.0, seconds), TIMEOUT_MAX))
+    except TimeoutError:
+        future.cancel()
+        return None
