@@ -1,9 +1,8 @@
 """Fast marching against a deadline: a ladder of grids, each begun only if it will end in time.
 
 The smallest grid is solved first. Its time, held against the ladder's usual one, is this machine's
-rate now; the next grid is the largest whose predicted time still fits. It is solved on another core
-and waited for until the deadline: if it is late all the same, the coarser one is the answer. Without
-a deadline there is nothing to weigh, and one grid of the default size is solved.
+rate now; the next grid is the largest whose predicted time still fits. Without a deadline there is
+nothing to weigh, and one grid of the default size is solved.
 """
 
 import logging
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from ocp.eikonal import NODES, EikonalSolution, solve_eikonal
 from ocp.grids.lookahead import LookaheadPolicy
 from ocp.query import Query
-from ocp.threads import in_time
 from ocp.value import Value
 
 log = logging.getLogger(__name__)
@@ -84,14 +82,12 @@ class EikonalPlanner:
         clock: seconds that pass; a test's own may be put here.
         solve: (query, nodes) -> solution.
         check: (query, policy, starts) -> whether its rollouts reach the goal.
-        in_time: (work, seconds) -> its answer, or `None` if that is not there in time.
     """
 
     seconds: float | None = None
     clock: Callable[[], float] = time.perf_counter
     solve: Solve = lambda query, nodes: solve_eikonal(query, nodes=nodes)
     check: Check = lambda query, policy, starts: reaches(query, policy, starts)
-    in_time: Callable[[Callable[[], LadderState], float], LadderState | None] = in_time
 
     def __post_init__(self) -> None:
         if self.seconds is not None and not self.seconds > 0:
@@ -118,20 +114,9 @@ class EikonalPlanner:
         return state if self.seconds is None else self._foresee(state)
 
     def refine(self, state: LadderState) -> LadderState:
-        """The next grid, unless it is late.
-
-        Its policy counts only if its rollouts reach the goal from every start.
-        """
+        """The next grid. Its policy counts only if its rollouts reach the goal from every start."""
         if state.following is None:
             return state
-        new = self.in_time(lambda: self._next(state), self._left(state))
-        if new is not None:
-            return self._foresee(new)
-        log.info("%d nodes are not solved in time; the coarser grid is kept", state.following)
-        return replace(state, following=None)
-
-    def _next(self, state: LadderState) -> LadderState:
-        assert state.following is not None
         began = self.clock()
         solution = self.solve(state.query, state.following)
         policy = solution.policy()
@@ -141,9 +126,10 @@ class EikonalPlanner:
             checked, took = self._checked(state.query, policy, state.starts)
         new = replace(state, nodes=state.following, pace=pace, check_seconds=took)
         if checked or not state.checked:
-            return replace(new, solution=solution, policy=policy, checked=checked)
-        log.info("the policy on %d nodes misses the goal; the coarser one is kept", new.nodes)
-        return new
+            new = replace(new, solution=solution, policy=policy, checked=checked)
+        else:
+            log.info("the policy on %d nodes misses the goal; the coarser one is kept", new.nodes)
+        return self._foresee(new)
 
     def policy(self, state: LadderState) -> LookaheadPolicy:
         return state.policy
@@ -155,13 +141,10 @@ class EikonalPlanner:
         began = self.clock()
         return self.check(query, policy, starts), self.clock() - began
 
-    def _left(self, state: LadderState) -> float:
-        assert self.seconds is not None
-        return state.begun + self.seconds - self.clock()
-
     def _foresee(self, state: LadderState) -> LadderState:
         """Choose the largest grid that ends in time, at the pace of the last one."""
-        left = self._left(state)
+        assert self.seconds is not None
+        left = state.begun + self.seconds - self.clock()
         check = state.check_seconds if state.check_seconds else 2 * LADDER[min(LADDER)] * state.pace
         check *= bool(state.starts)
         following, needed = None, 0.0

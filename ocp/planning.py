@@ -4,6 +4,8 @@ A planner is a start, a step and an answer. A one-shot method is a planner of on
 rules compose with `|` (either ends it) and know nothing of the method.
 """
 
+import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.query import Query
+from ocp.threads import in_time
 from ocp.value import Policy, Value
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -33,23 +38,33 @@ class Progress:
 
 @dataclass(frozen=True)
 class Until:
-    """A stopping rule."""
+    """A stopping rule.
+
+    Attributes:
+        satisfied: whether to stop rather than to begin the next refinement.
+        seconds: after the query; a refinement under way is then given up.
+    """
 
     satisfied: Callable[[Progress], bool]
+    seconds: float = math.inf
 
     def __or__(self, other: "Until") -> "Until":
-        return Until(lambda p: self.satisfied(p) or other.satisfied(p))
+        return Until(
+            lambda p: self.satisfied(p) or other.satisfied(p), min(self.seconds, other.seconds)
+        )
 
 
 def deadline(seconds: float) -> Until:
     """Stop rather than begin a refinement that would end more than `seconds` after the query.
+
+    One that takes longer than foreseen is given up: the answer is the best one before it.
 
     Raises:
         ValueError: if `seconds` is not positive.
     """
     if not seconds > 0:
         raise ValueError(f"deadline: must be a positive number of seconds, got {seconds}")
-    return Until(lambda p: p.seconds >= seconds)
+    return Until(lambda p: p.seconds >= seconds, seconds)
 
 
 def never() -> Until:
@@ -195,7 +210,18 @@ def plan(
     while not state.finished and not until.satisfied(
         Progress(time.perf_counter() - begun + state.next_seconds, done, state.trajectories)
     ):
-        state = planner.refine(state)
+        better = _refined(planner, state, begun + until.seconds)
+        if better is None:
+            log.info("refinement %d is late and left out", done + 1)
+            break
+        state = better
         done += 1
     policy, value = planner.policy(state), planner.value(state)
     return Plan(query, policy, value, time.perf_counter() - begun, state.trajectories)
+
+
+def _refined(planner: Planner, state: Any, end: float) -> Any:
+    """The next state, or `None` if it is not there at the time `end`."""
+    if end == math.inf:
+        return planner.refine(state)
+    return in_time(lambda: planner.refine(state), end - time.perf_counter())

@@ -43,14 +43,22 @@ def warm_workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, usable_cores() - 1), thread_name_prefix="zermelo")
 
 
+@cache
+def _steps() -> ThreadPoolExecutor:
+    """Threads of their own for `in_time`: its work may wait for that of `warm_workers`."""
+    return ThreadPoolExecutor(8, thread_name_prefix="zermelo-step")
+
+
 def in_time(work: Callable[[], Answer], seconds: float) -> Answer | None:
-    """The answer of `work`, done on another core; `None` if it is not there after `seconds`.
+    """The answer of `work`; `None` if it is not there after `seconds`.
 
     Work that is late goes on unheeded: it must change nothing but its answer.
     """
-    future = warm_workers().submit(work)
+    future = _steps().submit(work)
     try:
         return future.result(min(max(0.0, seconds), TIMEOUT_MAX))
     except TimeoutError:
+        if future.done():  # it ended in this very moment, or with a TimeoutError of its own
+            return future.result()
         future.cancel()
         return None

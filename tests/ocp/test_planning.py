@@ -1,5 +1,6 @@
 """The driver: stopping rules compose, refinements never outlast a deadline by design."""
 
+import threading
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -69,6 +70,31 @@ def test_a_refinement_that_would_outlast_the_deadline_is_not_begun() -> None:
     assert steps(deadline(1.0) | iterations(3), State(next_seconds=2.0)) == 0
     assert deadline(1.0).satisfied(Progress(1.0, 0, 0))
     assert not deadline(1.0).satisfied(Progress(0.999, 0, 0))
+
+
+def test_a_refinement_that_is_late_is_not_waited_for() -> None:
+    """It ends only once the answer is there, and the answer is the one before it."""
+    answered = threading.Event()
+
+    class Stuck(Counter):
+        def refine(self, state):
+            if state.steps == 2:
+                assert answered.wait(60)
+            return super().refine(state)
+
+    result: Any = plan(Stuck(State()), QUERY, [np.array([1.0])], deadline(0.3))
+    answered.set()
+    assert result.policy == 2
+
+
+def test_an_error_of_a_refinement_is_the_caller_s_also_before_a_deadline() -> None:
+    class Failing(Counter):
+        def refine(self, state):  # noqa: ARG002
+            raise TimeoutError("the planner's own")
+
+    for until in (deadline(60.0), iterations(1)):
+        with pytest.raises(TimeoutError, match="own"):
+            plan(Failing(State()), QUERY, [np.array([1.0])], until)
 
 
 def test_a_one_shot_method_is_a_planner_of_one_step() -> None:
