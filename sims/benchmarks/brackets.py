@@ -22,10 +22,10 @@ TOLERANCE = 1e-6
 notes = Console(stderr=True)
 
 
-def run(seed: int, _out: Path | None, queries: int = QUERIES) -> Report:
+def run(seed: int, _out: Path | None, queries: int = QUERIES, starts_each: int = STARTS) -> Report:
     """Upper bounds by rollout of the eikonal policy, lower bounds by subsolution.
 
-    `queries` with `STARTS` starts each; what was found so far is on standard error all along.
+    `queries` with `starts_each` starts each; what was found so far is on standard error all along.
     """
     rng = np.random.default_rng(seed)
     gaps, gaps_known, wrong, crossed, checked, lost, seconds = [], [], 0, 0, 0, 0, []
@@ -42,7 +42,7 @@ def run(seed: int, _out: Path | None, queries: int = QUERIES) -> Report:
             begun = time.process_time()
             bound = lower_bound(query)
             seconds.append(time.process_time() - begun)
-            starts = [sample_start(query, rng) for _ in range(STARTS)]
+            starts = [sample_start(query, rng) for _ in range(starts_each)]
             solution = solve_eikonal(query)
             loops = rollouts(solution.policy(), starts)
             exact = ExactValue(query, solution.policy())

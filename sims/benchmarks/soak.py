@@ -201,15 +201,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("name", choices=("kills", "deadlines", "brackets"))
     parser.add_argument("--count", type=int, required=True, help="kills, calls or brackets")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--starts", type=int, default=brackets.STARTS, help="brackets a query")
     asked = parser.parse_args(arguments)
     if asked.count < 3:
         parser.error(f"count: must be at least 3, got {asked.count}")
+    if asked.starts < 1:
+        parser.error(f"starts: must be at least 1, got {asked.starts}")
     if asked.name == "kills":
         report = kills(asked.seed, asked.count)
     elif asked.name == "deadlines":
         report = deadlines.run(asked.seed, None, asked.count)
     else:
-        report = brackets.run(asked.seed, None, -(-asked.count // brackets.STARTS))
+        report = brackets.run(asked.seed, None, -(-asked.count // asked.starts), asked.starts)
     for table in report.tables:
         Console(stderr=True, width=118).print(table)
     print(json.dumps(report.figures))
