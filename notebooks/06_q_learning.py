@@ -56,7 +56,7 @@ for learner, result in runs.items():
 axes[0].axhline(1.0, color="grey", linestyle=":", label="u = 0")
 axes[0].set(xlabel="seconds of data", ylabel="gain error over the horizon")
 axes[0].set_title("while data come in")
-axes[0].legend(frameon=False, loc="center right")
+axes[0].legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.12))
 times = np.linspace(0, system.cost.horizon, 200)
 learned = runs["q-learning"].gain
 assert learned is not None
