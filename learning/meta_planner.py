@@ -40,6 +40,7 @@ TRAJECTORIES = 8  # exact ones, from states of its own choice if no starts are a
 GRIDS = (4_500, 18_000, 60_000, 240_000)
 EARLY = 2  # so many starts are solved exactly before any grid
 CAUTION = 1.3  # by how much a step's expected time is overestimated
+OUTLIER = 4.0  # a step's time counts for at most so many times what was expected
 SUSPICION = 1.01  # an extremal that costs so many times a grid's value is in the wrong class
 
 
@@ -85,7 +86,12 @@ class Clock:
         return CAUTION * self.trajectory
 
     def learn(self, step: Step, seconds: float) -> None:
-        """Take note of a step's time."""
+        """Take note of a step's time.
+
+        An outlier counts in part only: the first step also loads code, and whoever believed that
+        time would never take a step before a deadline again, and so never learn better.
+        """
+        seconds = min(seconds, OUTLIER * self.expected(step) / CAUTION)
         if step.nodes:
             self.node += 0.5 * (max(seconds - self.grid, 0.0) / step.nodes - self.node)
         else:

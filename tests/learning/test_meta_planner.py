@@ -138,3 +138,15 @@ def test_how_many_cores_work_changes_the_time_alone() -> None:
         assert other.trajectories == 6
         np.testing.assert_array_equal(other.value.value(starts), answers[0].value.value(starts))
         np.testing.assert_array_equal(other.policy(starts), answers[0].policy(starts))
+
+
+@pytest.mark.parametrize("step", [Step(start=0), Step(nodes=60_000)], ids=["trajectory", "grid"])
+def test_one_slow_step_does_not_end_all_others(step: Step) -> None:
+    """The first one loads code, for seconds; steps that are always slow are believed."""
+    clock = Clock()
+    usual = clock.expected(step)
+    clock.learn(step, 5.0)
+    assert usual < clock.expected(step) < 3 * usual
+    for _ in range(20):
+        clock.learn(step, 10 * usual)
+    assert clock.expected(step) == pytest.approx(13 * usual, rel=0.05)
