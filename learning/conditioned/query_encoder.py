@@ -28,6 +28,12 @@ from ocp.trajectory import SolveError, Status
 Floats = NDArray[np.float64]
 
 REACH = 16.0  # metres from the goal up to which the value without obstacles is known
+NEAREST = 0.04
+"""V without obstacles below which its logarithm is a feature no longer.
+
+No state of the training lies nearer the goal, and V follows V without obstacles there. Extrapolated
+along the logarithm, the learned factor grew faster than V fell, and robots stopped 1 cm short.
+"""
 STATE_FEATURES, OBSTACLE_FEATURES = 9, 12
 ODD_STATE, ODD_OBSTACLE = (1,), (1, 5, 8)
 
@@ -168,9 +174,10 @@ def encode_state(
     features[4] = math.log(gap + 0.1)
     slopes[4, 0], slopes[4, 1] = -ex / (gap + 0.1), -ey / (gap + 0.1)
     features[5] = numbers[2]
-    features[6] = math.log(free[0] + 1e-3)
-    for i in range(3):
-        slopes[6, i] = free[1 + i] / (free[0] + 1e-3)
+    features[6] = math.log(max(free[0], NEAREST) + 1e-3)
+    if free[0] > NEAREST:
+        for i in range(3):
+            slopes[6, i] = free[1 + i] / (free[0] + 1e-3)
     # W with all obstacles, and by how much they raise it.
     gradient, hessian = np.empty(3), np.empty((3, 3))
     derivatives(x, q, gradient, hessian)

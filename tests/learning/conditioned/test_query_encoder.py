@@ -26,6 +26,15 @@ def states(query, count=40, seed=0):
     return np.array([sample_start(query, rng) for _ in range(count)])
 
 
+def beside_goal(query, gaps, seed=0):
+    """States `gaps` metres from the goal, headings within a radian of the way to it or back."""
+    rng = np.random.default_rng(seed)
+    bearing = rng.uniform(-np.pi, np.pi, len(gaps))
+    ray = np.column_stack([np.cos(bearing), np.sin(bearing)])
+    place = query.reference[:2] + (query.goal.radius + gaps)[:, None] * ray
+    return np.column_stack([place, bearing + rng.uniform(-1, 1, len(gaps))])
+
+
 def moved(query, place):
     """The query with every position mapped by `place`."""
     obstacles = tuple(
@@ -46,7 +55,7 @@ def features(query, x):
 
 def test_derivatives_are_those_of_the_features():
     """Central differences, whose error is h^2 times a third derivative."""
-    x, h = states(QUERY), 1e-5
+    x, h = np.concatenate([states(QUERY), beside_goal(QUERY, np.array([0.005, 0.01]))]), 1e-5
     encoder = QueryEncoder.of(QUERY)
     free, _, state_slopes, _, obstacle_slopes = encoder.encode(x)
     for i in range(3):
