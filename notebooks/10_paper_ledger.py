@@ -28,8 +28,8 @@ from sims.experiments.contestants import CONTESTANTS
 from sims.experiments.ledger import COLUMNS, cells
 from sims.experiments.measure import on_the_four_queries, optima_of_the_four_queries
 from sims.experiments.paper import BENCHMARK, GOALS, TABLE_I, mean_excess
-from sims.experiments.parts import Parts
 from sims.experiments.sheet import Sheet, percent
+from sims.parts import Parts
 
 LONG = ("set-valued-fine", "mpc-value", "repaired", "refmm-fine", "interpolation")
 temporary = tempfile.TemporaryDirectory()

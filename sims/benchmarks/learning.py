@@ -3,6 +3,7 @@
 Three families: the paper's, the general one, and the general one with seven to ten obstacles, which
 no network was trained on. The queries' seeds are far from those of training. Reached means within
 the loop's time limit; excess is over the exact cost; a collision is new if the optimum has none.
+With `--out` each query is kept as it is finished, and a run that was stopped goes on.
 """
 
 import time
@@ -30,8 +31,10 @@ from ocp.query_family import QueryFamily, sample_start
 from ocp.query_file import read_toml
 from ocp.trajectory import SolveError, Trajectory
 from ocp.value import Policy
+from ocp.version import code_version
 from sims.benchmarks import Report
 from sims.closed_loop import LoopSettings, rollouts
+from sims.parts import Parts
 
 SEED = 1_000_000  # added to the benchmark's seed: no training or selection saw these queries
 QUERIES, STARTS = 100, 20
@@ -87,6 +90,16 @@ class Score:
         self.costs += [np.nan] * len(problem.starts)
         self.optima += [optimum.cost for optimum in problem.optima]
 
+    def record(self) -> dict[str, list[Any]]:
+        """Everything as plain data for JSON: a cost is `None` where the goal was not reached."""
+        costs = [None if np.isnan(c) else c for c in self.costs]
+        return {**vars(self), "costs": costs}
+
+    def extend(self, record: dict[str, list[Any]]) -> None:
+        """Add what `record` told of another score."""
+        for name, more in record.items():
+            getattr(self, name).extend(np.nan if m is None else m for m in more)
+
     def figures(self) -> dict[str, float | None]:
         """Everything measured, as fractions and seconds; `None` where there was nothing."""
         cost, optimum = np.array(self.costs), np.array(self.optima)
@@ -117,39 +130,54 @@ def families() -> dict[str, QueryFamily]:
     return {"paper": load_family("paper"), "general": load_family("general"), "crowded": crowded}
 
 
-def run(seed: int, _out: Path | None, queries: int = QUERIES, starts: int = STARTS) -> Report:
+def run(seed: int, out: Path | None, queries: int = QUERIES, starts: int = STARTS) -> Report:
     """A table for each family."""
     report = Report()
+    parts = kept("learning", seed, out)
     for name, family in families().items():
-        scores: dict[str, Score] = {}
-        for problem in problems(family, seed, queries, starts):
-            for method, solver in fixed_methods(name).items():
-                _measure(scores.setdefault(method, Score()), problem, solver)
+        methods = fixed_methods(name)
+        warm: set[str] = set()
+        scores = {method: Score() for method in methods}
+        for k in range(queries):
+            records = parts.get(
+                f"{name}-{k}",
+                {"starts": starts},
+                lambda k=k, family=family, methods=methods, warm=warm: _judged(
+                    problem(family, seed, k, starts), methods, warm
+                ),
+            )
+            notes.print(f"{name}: query {k + 1} of {queries}", highlight=False)
+            for method, record in records.items():
+                scores[method].extend(record)
         figures = {method: score.figures() for method, score in scores.items()}
         report.figures[name] = figures
         report.tables.append(_table(f"{name}: {queries} queries x {starts} starts", figures))
     return report
 
 
-def problems(family: QueryFamily, seed: int, queries: int, starts: int) -> Any:
-    """Fresh queries with starts and optima; starts without an established optimum are dropped."""
-    for k in range(queries):
-        rng = np.random.default_rng([SEED + seed, k])
-        query = family.sample(rng)
-        known: list[tuple[NDArray[np.float64], Trajectory]] = []
-        drawn = [sample_start(query, rng) for _ in range(starts)]
-        fine = solve_eikonal(query).policy()
-        for start, guess in zip(drawn, rough(query, fine, np.array(drawn)), strict=True):
-            try:
-                best = exact_trajectory(query, start)
-            except SolveError as error:
-                notes.print(f"{family.name} {k}: no optimum from {start}: {error}")
-                continue
-            # The search may miss a class of motions that a fine grid finds.
-            other = None if guess is None else find_extremal(query, start, guess).trajectory
-            known.append((start, other if other and other.cost < best.cost else best))
-        notes.print(f"{family.name}: query {k + 1} of {queries}", highlight=False)
-        yield Problem(query, [s for s, _ in known], [t for _, t in known])
+def kept(name: str, seed: int, out: Path | None) -> Parts:
+    """Where a benchmark keeps its queries: nowhere without a folder for results."""
+    folder = None if out is None else out / name
+    return Parts(folder, {"seed": seed, "code": code_version()})
+
+
+def problem(family: QueryFamily, seed: int, k: int, starts: int) -> Problem:
+    """The k-th fresh query, starts and optima; starts without an established one are dropped."""
+    rng = np.random.default_rng([SEED + seed, k])
+    query = family.sample(rng)
+    known: list[tuple[NDArray[np.float64], Trajectory]] = []
+    drawn = [sample_start(query, rng) for _ in range(starts)]
+    fine = solve_eikonal(query).policy()
+    for start, guess in zip(drawn, rough(query, fine, np.array(drawn)), strict=True):
+        try:
+            best = exact_trajectory(query, start)
+        except SolveError as error:
+            notes.print(f"{family.name} {k}: no optimum from {start}: {error}")
+            continue
+        # The search may miss a class of motions that a fine grid finds.
+        other = None if guess is None else find_extremal(query, start, guess).trajectory
+        known.append((start, other if other and other.cost < best.cost else best))
+    return Problem(query, [s for s, _ in known], [t for _, t in known])
 
 
 def fixed_methods(family: str) -> dict[str, Solver]:
@@ -180,10 +208,19 @@ def eikonal(nodes: int, query: Query, _starts: list[NDArray[np.float64]]) -> tup
     return policy, time.perf_counter() - begun
 
 
-def _measure(score: Score, problem: Problem, solver: Solver) -> None:
-    if not score.seconds:
-        solver(problem.query, problem.starts)  # loads compiled code
-    score.add(problem, *solver(problem.query, problem.starts))
+def _judged(
+    posed: Problem, methods: dict[str, Solver], warm: set[str]
+) -> dict[str, dict[str, list[Any]]]:
+    """Each method's score on one problem; `warm` are those whose code is loaded already."""
+    records = {}
+    for method, solver in methods.items():
+        if method not in warm:
+            solver(posed.query, posed.starts)
+            warm.add(method)
+        score = Score()
+        score.add(posed, *solver(posed.query, posed.starts))
+        records[method] = score.record()
+    return records
 
 
 def shown(figure: float | None, form: str, unit: float = 1.0) -> str:

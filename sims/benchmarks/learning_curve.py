@@ -24,8 +24,10 @@ from sims.benchmarks.learning import (
     Solver,
     eikonal,
     families,
+    kept,
+    notes,
     planned,
-    problems,
+    problem,
     shown,
 )
 from sims.closed_loop import LoopSettings
@@ -68,14 +70,23 @@ class Point:
 def run(seed: int, out: Path | None, queries: int = QUERIES, starts: int = STARTS) -> Report:
     """A table and a figure for each of the two families."""
     report = Report()
+    parts = kept("learning-curve", seed, out)
     for name in ("paper", "general"):
         points = _points(name)
-        scores = [Score() for _ in points]
-        failures = [0] * len(points)
-        for k, problem in enumerate(problems(families()[name], seed + 1, queries, starts)):
-            for i, point in enumerate(points):
-                if k < point.queries:
-                    failures[i] += not _scored(scores[i], point, problem)
+        scores, failures = [Score() for _ in points], [0] * len(points)
+        warm: set[int] = set()
+        for k in range(queries):
+            records = parts.get(
+                f"{name}-{k}",
+                {"starts": starts, "points": [[p.label, p.size] for p in points]},
+                lambda name=name, k=k, points=points, warm=warm: _judged(
+                    points, problem(families()[name], seed + 1, k, starts), k, warm
+                ),
+            )
+            notes.print(f"{name}: query {k + 1} of {queries}", highlight=False)
+            for i, (failed, record) in records.items():
+                failures[int(i)] += failed
+                scores[int(i)].extend(record)
         rows = [
             {"method": p.label, "size": p.size, "failures": failed, **score.figures()}
             for p, score, failed in zip(points, scores, failures, strict=True)
@@ -113,17 +124,24 @@ def _points(name: str) -> list[Point]:
     return points
 
 
-def _scored(score: Score, point: Point, problem: Problem) -> bool:
-    """Whether there was a policy; if not, no start counts as reached."""
-    try:
-        if not score.seconds and point.queries == QUERIES:
-            point.solver(problem.query, problem.starts)  # loads compiled code
-        policy, seconds = point.solver(problem.query, problem.starts)
-    except (SolveError, FloatingPointError):
-        score.add_failure(problem)
-        return False
-    score.add(problem, policy, seconds, point.period)
-    return True
+def _judged(points: list[Point], posed: Problem, k: int, warm: set[int]) -> dict[str, Any]:
+    """Whether each point had no policy for the k-th problem, and its score; by its number."""
+    found = {}
+    for i, point in enumerate(points):
+        if k >= point.queries:
+            continue
+        score, failed = Score(), False
+        try:
+            if i not in warm and point.queries == QUERIES:
+                point.solver(posed.query, posed.starts)  # loads compiled code
+                warm.add(i)
+            policy, seconds = point.solver(posed.query, posed.starts)
+            score.add(posed, policy, seconds, point.period)
+        except (SolveError, FloatingPointError):
+            failed = True
+            score.add_failure(posed)
+        found[str(i)] = (failed, score.record())
+    return found
 
 
 def _table(title: str, rows: list[dict[str, Any]]) -> Table:

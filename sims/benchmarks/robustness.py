@@ -17,7 +17,7 @@ from ocp.planning import Planner, plan, trajectories
 from ocp.query_family import PAPER_FAMILY
 from ocp.value import Policy
 from sims.benchmarks import Report
-from sims.benchmarks.learning import Problem, problems
+from sims.benchmarks.learning import Problem, notes, problem
 from sims.closed_loop import LoopSettings, rollouts
 from sims.disturbance import Disturbance
 from sims.methods import METHODS
@@ -164,12 +164,14 @@ def run(
 ) -> Report:
     """Every contender under every disturbance."""
     trials = {c.label: {name: Trials() for name in DISTURBANCES} for c in contenders}
-    for k, problem in enumerate(problems(PAPER_FAMILY, seed, queries, starts)):
+    for k in range(queries):
+        posed = problem(PAPER_FAMILY, seed, k, starts)
+        notes.print(f"query {k + 1} of {queries}", highlight=False)
         for contender in contenders:
             if contender.slow and k >= SLOW_QUERIES:
                 continue
             count = SLOW_STARTS if contender.slow else starts
-            part = Problem(problem.query, problem.starts[:count], problem.optima[:count])
+            part = Problem(posed.query, posed.starts[:count], posed.optima[:count])
             policy = contender.solver(part)
             for i, (name, disturbance) in enumerate(DISTURBANCES.items()):
                 noise = int(np.random.default_rng([seed, k, i]).integers(2**31))

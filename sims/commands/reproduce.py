@@ -14,7 +14,7 @@ from sims.benchmarks import machine
 from sims.exit_status import reading_input
 from sims.experiments import EXPERIMENTS, Findings, Setting, experiment
 from sims.experiments.ledger import ledger
-from sims.experiments.parts import Parts
+from sims.parts import Parts
 
 if TYPE_CHECKING:
     from sims import cli

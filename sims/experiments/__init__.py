@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from sims.experiments.parts import Parts
 from sims.experiments.sheet import Sheet
+from sims.parts import Parts
 
 EXPERIMENTS: dict[str, str] = {
     "table1": "total costs from (-4, -4, -pi/4) to the four goals, every method",

@@ -11,8 +11,8 @@ from sims.closed_loop import Rollout
 from sims.experiments import Entry, Findings, Setting
 from sims.experiments.contestants import CONTESTANTS, contestant
 from sims.experiments.measure import judged, truth
-from sims.experiments.parts import Parts
 from sims.experiments.sheet import Sheet, number, percent
+from sims.parts import Parts
 
 GOALS = ((4.0, 4.0), (1.0, 1.0), (1.0, 4.0), (4.0, 1.0))
 """In the order of the figure's panels."""

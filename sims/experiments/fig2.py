@@ -18,8 +18,8 @@ from sims.closed_loop import LoopSettings, rollouts
 from sims.experiments import Entry, Findings, Setting
 from sims.experiments.contestants import contestant
 from sims.experiments.measure import rehearse, truth
-from sims.experiments.parts import Parts
 from sims.experiments.sheet import ABSENT, Sheet, number, seconds
+from sims.parts import Parts
 
 log = logging.getLogger(__name__)
 

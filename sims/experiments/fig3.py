@@ -24,8 +24,8 @@ from sims.experiments import Entry, Findings, Setting
 from sims.experiments.contestants import contestant
 from sims.experiments.generation import PRELOAD, generated
 from sims.experiments.measure import rehearse
-from sims.experiments.parts import Parts
 from sims.experiments.sheet import ABSENT, Sheet, number, percent, seconds
+from sims.parts import Parts
 
 METHODS = ("faithful", "repaired", "adapt")
 WORKERS = (1, 2, 4)

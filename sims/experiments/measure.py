@@ -17,7 +17,7 @@ from ocp.trajectory import SolveError, Trajectory
 from sims.closed_loop import LoopSettings, Rollout, rollouts
 from sims.experiments.contestants import Contestant
 from sims.experiments.paper import GOALS
-from sims.experiments.parts import Parts
+from sims.parts import Parts
 
 log = logging.getLogger(__name__)
 

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from sims.experiments import Entry, Findings, Setting
-from sims.experiments.parts import Parts
 from sims.experiments.sheet import Sheet, number
+from sims.parts import Parts
 
 SCENARIO = Path(__file__).resolve().parents[1] / "scenarios" / "figure-2.toml"
 CONTROLLERS = ("q-learning", "riccati")

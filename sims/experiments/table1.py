@@ -9,8 +9,8 @@ from sims.experiments import Entry, Findings, Setting
 from sims.experiments.contestants import CONTESTANTS, Contestant
 from sims.experiments.measure import on_the_four_queries, optima_of_the_four_queries
 from sims.experiments.paper import BENCHMARK, GOALS, TABLE_I, mean_excess
-from sims.experiments.parts import Parts
 from sims.experiments.sheet import ABSENT, Sheet, number, percent
+from sims.parts import Parts
 
 TICKS = (0, 0.5, 1, 2, 5, 10, 20, 40, 80)
 

@@ -14,9 +14,9 @@ from sims.experiments.contestants import CONTESTANTS
 from sims.experiments.generation import PRELOAD, generated
 from sims.experiments.measure import on_the_four_queries
 from sims.experiments.paper import GOALS, TABLE_II
-from sims.experiments.parts import Parts
 from sims.experiments.sheet import ABSENT, Sheet, seconds
 from sims.experiments.table1 import skipped
+from sims.parts import Parts
 
 WORKERS = (1, 2, 4)
 TRAJECTORIES = 8

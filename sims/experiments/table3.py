@@ -13,8 +13,8 @@ from ocp.trajectory import SolveError, Trajectory
 from sims.experiments import Entry, Findings, Setting
 from sims.experiments.generation import SAMPLES
 from sims.experiments.paper import TABLE_III
-from sims.experiments.parts import Parts
 from sims.experiments.sheet import Sheet, percent, seconds
+from sims.parts import Parts
 
 TRAJECTORIES = 8
 

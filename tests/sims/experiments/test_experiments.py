@@ -14,7 +14,7 @@ from sims.experiments import EXPERIMENTS, Setting, experiment, fig2, fig3, table
 from sims.experiments import ledger as ledgers
 from sims.experiments.contestants import CONTESTANTS, NEVER, Contestant, contestant
 from sims.experiments.paper import GOALS, TABLE_I
-from sims.experiments.parts import Parts
+from sims.parts import Parts
 
 
 def fails(_query, _starts):

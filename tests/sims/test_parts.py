@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sims.experiments.parts import Parts
+from sims.parts import Parts
 
 
 class Counter:

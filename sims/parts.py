@@ -1,4 +1,4 @@
-"""Finished parts of an experiment, kept so that a run that was stopped goes on where it was."""
+"""Finished parts of long work, kept so that a run that was stopped goes on where it was."""
 
 import json
 import logging
@@ -17,11 +17,11 @@ class Parts:
     """Parts as JSON files in a folder, each with the configuration that made it.
 
     Attributes:
-        folder: where they are.
+        folder: where they are; `None` keeps nothing.
         common: configuration of all parts, such as seed and version of the code.
     """
 
-    folder: Path
+    folder: Path | None
     common: dict[str, Any]
 
     def get(self, name: str, config: dict[str, Any], compute: Callable[[], Any]) -> Any:
@@ -35,6 +35,8 @@ class Parts:
             config: what the answer depends on, beside `common`.
             compute: returns plain data for JSON.
         """
+        if self.folder is None:
+            return compute()
         wanted = json.loads(json.dumps({**self.common, **config}))
         path = self.folder / f"{name}.json"
         if path.is_file():
