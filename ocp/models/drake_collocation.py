@@ -1,11 +1,14 @@
 """Drake's DirectCollocation on the same problem: a referee that shares no code with ours.
 
 Drake transcribes with Hermite-Simpson dynamics and the trapezoid rule for the cost (Hargraves and
-Paris 1987), evaluates the plant by automatic differentiation, and calls IPOPT.
+Paris 1987), evaluates the plant by automatic differentiation, and calls IPOPT or SNOPT. It gives no
+second derivatives, so both build their own from gradients; on the acrobot IPOPT's (limited memory)
+stall, SNOPT's do not.
 """
 
 import time
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,13 @@ from ocp.query import Query
 from ocp.trajectory import SolveError, Status, Trajectory
 
 Array = NDArray[np.float64]
+
+
+class Solver(Enum):
+    """Of Drake's nonlinear programmes."""
+
+    IPOPT = "ipopt"
+    SNOPT = "snopt"
 
 
 @dataclass(frozen=True)
@@ -46,6 +56,7 @@ def drake_collocation(
     tolerance: float = 1e-6,
     max_iterations: int = 1000,
     time_limit: float = np.inf,
+    solver: Solver = Solver.IPOPT,
 ) -> DrakeMotion:
     """The motion over the guess's horizon that minimises running plus terminal cost.
 
@@ -56,16 +67,17 @@ def drake_collocation(
         guess: from the start; its duration is the horizon.
         terminal: P `[n, n]`.
         knots: of the transcription.
-        tolerance: of IPOPT.
-        max_iterations: of IPOPT.
-        time_limit: processor seconds of IPOPT.
+        tolerance: of the solver; SNOPT minimises the cost in units of the guess's.
+        max_iterations: of the solver.
+        time_limit: processor seconds of the solver.
+        solver: which one.
 
     Raises:
-        SolveError: if IPOPT did not converge.
+        SolveError: if the solver did not converge.
     """
     import pydrake.symbolic as symbolic
     from pydrake.planning import DirectCollocation
-    from pydrake.solvers import IpoptSolver, SolverOptions
+    from pydrake.solvers import IpoptSolver, SnoptSolver, SolverOptions
     from pydrake.trajectories import PiecewisePolynomial
 
     began = time.perf_counter()
@@ -98,9 +110,13 @@ def drake_collocation(
     effort = sum(
         w * (a - b) ** 2 for w, a, b in zip(weights, u, query.reference_input, strict=True)
     )
-    programme.AddRunningCost(_quadratic(x, goal, M, system.period, symbolic) + effort)
+    # SNOPT's tolerances are for costs of order 1; IPOPT scales by itself.
+    unit = max(guess.cost, 1.0) if solver is Solver.SNOPT else 1.0
+    running = _quadratic(x, goal, M, system.period, symbolic) + effort
+    programme.AddRunningCost(running / unit)
     final = ours(programme.final_state())
-    mathematical.AddCost(_quadratic(final, goal, np.asarray(terminal), system.period, symbolic))
+    P = np.asarray(terminal) / unit
+    mathematical.AddCost(_quadratic(final, goal, P, system.period, symbolic))
     for obstacle in query.hard_obstacles:
         gap = (obstacle.radius + query.robot_radius) ** 2
         place = [x[i] for i in system.position]
@@ -114,13 +130,24 @@ def drake_collocation(
         PiecewisePolynomial.FirstOrderHold(times, states[inverse]),
     )
     options = SolverOptions()
-    solver = IpoptSolver()
-    options.SetOption(solver.id(), "tol", tolerance)
-    options.SetOption(solver.id(), "max_iter", max_iterations)
+    engine: Any = IpoptSolver() if solver is Solver.IPOPT else SnoptSolver()
+    if solver is Solver.IPOPT:
+        named: dict[str, Any] = {"tol": tolerance, "max_iter": max_iterations}
+        limit = "max_cpu_time"
+    else:
+        named = {
+            "Major optimality tolerance": tolerance,
+            "Major iterations limit": max_iterations,
+            "Iterations limit": 1000 * max_iterations,
+            "Superbasics limit": knots * (n + system.m),
+        }
+        limit = "Time limit"
     if time_limit < np.inf:
-        options.SetOption(solver.id(), "max_cpu_time", float(time_limit))
+        named[limit] = float(time_limit)
+    for name, value in named.items():
+        options.SetOption(engine.id(), name, value)
     built = time.perf_counter()
-    result = solver.Solve(mathematical, None, options)
+    result = engine.Solve(mathematical, None, options)
     ended = time.perf_counter()
     if not result.is_success():
         raise SolveError(Status.NOT_CONVERGED, f"Drake: {result.get_solution_result()}")
@@ -129,7 +156,7 @@ def drake_collocation(
         programme.GetSampleTimes(result),
         found,
         programme.GetInputSamples(result).T,
-        float(result.get_optimal_cost()),
+        unit * float(result.get_optimal_cost()),
         built - began,
         ended - built,
     )
