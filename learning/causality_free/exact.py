@@ -9,11 +9,12 @@ guesses come from the network too.)
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from learning.causality_free.sidestep import sidesteps
 from ocp.compiled.batch import running_costs
 from ocp.extremals.extremal import SEGMENTS, find_extremal
 from ocp.extremals.transversality import quadratic_condition
@@ -30,8 +31,9 @@ LONGEST = 20.0  # seconds of a guess
 STEP = 0.02  # seconds of a guess's step, at most
 STEP_TOLERANCE = 1e-11  # of the integration
 GROWTH, MAX_SEGMENTS = 1.5, 200  # exponent by which errors may grow in a segment; how many
-FIRST_SHARE = 0.4  # of the way from the equilibrium to the start, where continuation begins
+FIRST_SHARE = 0.4  # of the way (to the start, to the obstacles' weight) where continuation begins
 MOST_CONTINUATIONS = 16  # motions tried
+FELT = 0.02  # penalty of an obstacle along a motion that is worth passing it on another side
 FAR = 1e3  # a loop that gets so far has diverged
 
 
@@ -167,7 +169,8 @@ def exact_trajectories(
     """Exact motions from states `[k, n]`, by the first of `values` whose closed loop leads to one.
 
     Where none does, by continuation from the equilibrium, unless that is not wanted; `None` where
-    that fails too.
+    that fails too. Among obstacles the cheapest of that motion and of those that pass the obstacles
+    it feels on either side.
     """
     rows = np.atleast_2d(np.asarray(starts, dtype=float))
     found: list[Optimum | None] = [None] * len(rows)
@@ -179,9 +182,49 @@ def exact_trajectories(
             if guess is not None:
                 found[i] = exact_from(query, guess)
     for i, optimum in enumerate(found):
-        if optimum is None and continuation:
+        if optimum is None and query.obstacles:
+            found[i] = among_growing_obstacles(query, values[-1], rows[i])
+        if found[i] is None and continuation:
             found[i] = continued(query, rows[i])
-    return found
+    return _cheapest_way(query, found, rows)
+
+
+def among_growing_obstacles(query: Query, value: Value, start: Array) -> Optimum | None:
+    """The exact motion from `start` `[n]`, continued from the one without obstacles, or `None`."""
+    cost = query.cost
+    guess = closed_loops(replace(query, obstacles=()), value, start)[0]
+    share, step = 0.0, FIRST_SHARE
+    for _ in range(MOST_CONTINUATIONS):
+        if guess is None:
+            return None
+        reached = min(1.0, share + step)
+        weaker = replace(query, cost=replace(cost, obstacle=reached * cost.obstacle))
+        found = exact_from(query if reached == 1.0 else weaker, guess)
+        if found is None:
+            step /= 2
+            continue
+        guess, share, step = found.motion, reached, 1.5 * step
+        if share == 1.0:
+            return found
+    return None
+
+
+def _cheapest_way(query: Query, found: list[Optimum | None], starts: Array) -> list[Optimum | None]:
+    best = list(found)
+    for way in sidesteps(query):
+        felt = [
+            i
+            for i, optimum in enumerate(found)
+            if optimum is None or way.nearness(optimum.motion.states) > FELT
+        ]
+        if not felt:
+            continue
+        for i, guess in zip(felt, closed_loops(query, way, starts[felt]), strict=True):
+            rival = None if guess is None else exact_from(query, guess)
+            mine = best[i]
+            if rival is not None and (mine is None or rival.cost < mine.cost):
+                best[i] = rival
+    return best
 
 
 def _segments(query: Query, duration: float) -> int:

@@ -1,11 +1,12 @@
 """Families of regulation problems: what varies from query to query, and where motions start.
 
-A family is told from a query alone, by its `context`: what the cost and the input limits are. The
-goal may be anywhere where the robot does not notice the difference (`free_coordinates`).
+A family is told from a query alone, by its `context`: what the cost and the input limits are, and
+by where its obstacles lie. The goal may be anywhere where the robot does not notice the difference
+(`free_coordinates`).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import casadi as ca
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from ocp.cost import RunningCost
 from ocp.models import get_model
 from ocp.models.moving_frame import CRUISE
+from ocp.obstacle import Obstacle
 from ocp.query import Equilibrium, Query
 from ocp.system import System
 from ocp.trajectory import SolveError, Status
@@ -25,6 +27,63 @@ GOAL_RADIUS = 0.1
 """Of the region that counts as reached, over all coordinates."""
 
 
+SHADOW = (1.2, 1.8)
+"""A start behind an obstacle is so many times as far from the goal."""
+
+
+@dataclass(frozen=True)
+class Layouts:
+    """Layouts of soft circles round the goal, so far from it that resting there costs nothing.
+
+    Attributes:
+        most: of them, at least one.
+        radii: smallest and largest, metres.
+        extent: `[d]`, centres lie within so much of the goal in each coordinate.
+        weight, steepness: of the penalty, as in `RunningCost`.
+        at_goal: the most that one penalty may be at the goal.
+    """
+
+    most: int
+    radii: tuple[float, float]
+    extent: tuple[float, ...]
+    weight: float
+    steepness: float
+    at_goal: float = 3e-7
+
+    def clear(self, radius: float) -> float:
+        """Least distance from the goal to the centre of a circle, metres."""
+        return float(np.sqrt(radius**2 + np.log(self.weight / self.at_goal) / self.steepness))
+
+    def sample(self, goal: Array, rng: np.random.Generator) -> tuple[Obstacle, ...]:
+        """One to `most` circles that do not overlap, round `goal` `[d]`."""
+        wanted, found = int(rng.integers(1, self.most + 1)), []
+        while len(found) < wanted:
+            radius = float(rng.uniform(*self.radii))
+            offset = rng.uniform(-1, 1, len(self.extent)) * self.extent
+            gaps = [np.linalg.norm(goal + offset - o.center) - o.radius - radius for o in found]
+            if np.linalg.norm(offset) >= self.clear(radius) and min(gaps, default=0.0) >= 0:
+                found.append(Obstacle.circle(goal + offset, radius))
+        return tuple(found)
+
+    def why_foreign(self, query: Query) -> str | None:
+        """Why a query's obstacles are none of these; `None` if they are."""
+        cost, lower, upper = query.cost, *self.radii
+        slack = 1e-9 + 0.25 * (upper - lower)
+        if not 1 <= len(query.obstacles) <= self.most:
+            return f"there are {len(query.obstacles)} obstacles, not 1 to {self.most}"
+        if any(o.vertices or o.hard for o in query.obstacles):
+            return "the obstacles are not soft circles"
+        if (cost.obstacle, cost.obstacle_steepness) != (self.weight, self.steepness):
+            return f"the penalty's weight and steepness are not {self.weight}, {self.steepness}"
+        for o in query.obstacles:
+            offset = np.abs(np.array(o.center) - query.goal_position)
+            if not lower - slack <= o.radius <= upper + slack:
+                return f"an obstacle's radius is not within {lower} to {upper} m"
+            if (offset > 1.1 * np.array(self.extent)).any():
+                return "an obstacle lies farther from the goal than any that was trained on"
+        return None
+
+
 @dataclass(frozen=True)
 class RegulationFamily:
     """A distribution of queries with a common robot, and of starts.
@@ -33,38 +92,74 @@ class RegulationFamily:
         name: for records and messages.
         draw: one query from a random generator.
         reach: `[n]`, starts are uniform within so much of the goal in each coordinate.
-        mirror: `[n]`, signs of a reflection of the offset from the goal under which V is unchanged;
-            empty if there is none.
+        mirror: `[n]`, signs of a reflection of the offset from the goal under which V is unchanged,
+            if the obstacles are reflected too; empty if there is none.
+        layouts: of obstacles; `None` if there are none.
     """
 
     name: str
     draw: Callable[[np.random.Generator], Query]
     reach: tuple[float, ...]
     mirror: tuple[float, ...] = ()
+    layouts: Layouts | None = None
 
     def sample(self, rng: np.random.Generator) -> Query:
         """One query."""
         return self.draw(rng)
 
     def starts(self, query: Query, count: int, rng: np.random.Generator) -> Array:
-        """`[count, n]`, uniform round the goal."""
-        reach = np.array(self.reach)
-        return query.reference + rng.uniform(-reach, reach, (count, len(reach)))
+        """`[count, n]`, uniform round the goal, outside obstacles.
+
+        Where there are obstacles every second start lies behind one, seen from the goal.
+        """
+        return np.array([self._start(query, k % 2 == 1, rng) for k in range(count)])
+
+    def _start(self, query: Query, behind: bool, rng: np.random.Generator) -> Array:
+        reach, place = np.array(self.reach), list(query.system.position)
+        while True:
+            offset = rng.uniform(-reach, reach)
+            if behind and query.obstacles:
+                hidden = query.obstacles[rng.integers(len(query.obstacles))]
+                away = np.array(hidden.center) - query.goal_position
+                aside = 0.5 * hidden.radius * rng.normal(size=len(place))
+                offset[place] = rng.uniform(*SHADOW) * away + aside
+                if (np.abs(offset) > reach).any():
+                    continue
+            if query.clearance(query.reference + offset) >= 0:
+                return query.reference + offset
+
+    def why_foreign(self, query: Query) -> str | None:
+        """Why a query's obstacles are none of the family's; `None` if they are."""
+        if self.layouts is not None:
+            return self.layouts.why_foreign(query)
+        return "there are obstacles" if query.obstacles else None
+
+
+def mirrored(query: Query, signs: Array) -> Query:
+    """The query reflected at its goal by `signs` `[n]`: its obstacles lie on the other side."""
+    if not query.obstacles:
+        return query
+    goal, flip = query.goal_position, signs[list(query.system.position)]
+    return replace(
+        query,
+        obstacles=tuple(
+            replace(o, center=tuple(map(float, goal + flip * (np.array(o.center) - goal))))
+            for o in query.obstacles
+        ),
+    )
 
 
 def context(query: Query) -> Array:
-    """What tells a regulation query from others of the same robot, `[n + 3 m]`.
+    """What tells a regulation query from others of the same robot and layout, `[n + 3 m]`.
 
     Roots of the diagonals of M and R, and the reciprocals of the room that each input has above and
     below the one that holds the equilibrium (0 without a bound).
 
     Raises:
-        SolveError: NOT_APPLICABLE for goal balls, obstacles, other costs.
+        SolveError: NOT_APPLICABLE for goal balls, other costs.
     """
     if not query.is_regulation:
         raise _refusal("the goal is no equilibrium")
-    if query.obstacles:
-        raise _refusal("there are obstacles")
     if query.cost.own:
         raise _refusal("the cost is not quadratic alone")
     M = np.array(query.cost.state)
@@ -151,12 +246,58 @@ def _draw_car(rng: np.random.Generator) -> Query:
     return merging_car([along, across, 0.5, 0.3, 0.3], effort, limits)
 
 
+TRAFFIC = Layouts(most=3, radii=(0.3, 0.5), extent=(2.4, 1.2), weight=3.0, steepness=6.0)
+
+
+def car_in_traffic(query: Query, others: tuple[Obstacle, ...]) -> Query:
+    """The merging car among `others` that drive along in the lane, at rest in the slot's frame."""
+    cost = replace(query.cost, obstacle=TRAFFIC.weight, obstacle_steepness=TRAFFIC.steepness)
+    return replace(query, cost=cost, obstacles=others)
+
+
+def _draw_traffic(rng: np.random.Generator) -> Query:
+    query = _draw_car(rng)
+    return car_in_traffic(query, TRAFFIC.sample(query.goal_position, rng))
+
+
 FAMILIES: dict[str, RegulationFamily] = {
     "quadrotor": RegulationFamily(
         "quadrotor", _draw_quadrotor, (3.0, 3.0, 1.2, 3.0, 3.0, 3.0), (-1, 1, -1, -1, 1, -1)
     ),
     "car": RegulationFamily("car", _draw_car, (2.5, 2.0, 0.8, 0.7, 0.4), (1, -1, -1, 1, -1)),
+    "traffic": RegulationFamily(
+        "traffic", _draw_traffic, (3.5, 1.8, 0.6, 0.7, 0.3), (1, -1, -1, 1, -1), TRAFFIC
+    ),
 }
+
+
+def balancing(model: str, state: list[float], weights: list[float], effort: float) -> Query:
+    """A pole on its tip, at rest at `state`."""
+    return Query(
+        model,
+        Equilibrium(tuple(state), 0.2),
+        cost=RunningCost(goal=0.0, state=_diagonal(weights), input=(effort,)),
+    )
+
+
+def _draw_pendulum(rng: np.random.Generator) -> Query:
+    angle, rate, effort = (_log_uniform(rng, 0.5, 2.0) for _ in range(3))
+    return balancing("pendulum", [np.pi, 0.0], [5 * angle, 0.5 * rate], effort)
+
+
+def _draw_cart_pole(rng: np.random.Generator) -> Query:
+    place, angle, effort = (_log_uniform(rng, 0.5, 2.0) for _ in range(3))
+    weights = [place, 5 * angle, 0.1, 0.1]
+    return balancing("cart_pole", [0.0, np.pi, 0.0, 0.0], weights, 0.05 * effort)
+
+
+SMALL: dict[str, RegulationFamily] = {
+    "pendulum": RegulationFamily("pendulum", _draw_pendulum, (0.35, 0.8), (-1, -1)),
+    "cart-pole": RegulationFamily(
+        "cart-pole", _draw_cart_pole, (0.8, 0.5, 0.8, 1.0), (-1, -1, -1, -1)
+    ),
+}
+"""Near the upright rest, where no swing pays; trained in a minute, no weights are shipped."""
 
 
 def get_family(name: str) -> RegulationFamily:
@@ -165,6 +306,7 @@ def get_family(name: str) -> RegulationFamily:
     Raises:
         ValueError: if it is unknown; the message lists those that are known.
     """
-    if name not in FAMILIES:
-        raise ValueError(f"family: {name!r} is unknown; known are {', '.join(FAMILIES)}")
-    return FAMILIES[name]
+    known = FAMILIES | SMALL
+    if name not in known:
+        raise ValueError(f"family: {name!r} is unknown; known are {', '.join(known)}")
+    return known[name]

@@ -98,6 +98,9 @@ class Pretrained:
             told = context(query)
         except SolveError as error:
             return error.detail
+        foreign = self.family.why_foreign(query)
+        if foreign is not None:
+            return foreign
         free = free_coordinates(query.system)
         fixed = [i for i in range(query.system.n) if i not in free]
         if np.abs(query.reference - self.reference)[fixed].max() > 1e-9:

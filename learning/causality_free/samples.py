@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from learning.causality_free.exact import Optimum
-from learning.causality_free.families import RegulationFamily
+from learning.causality_free.families import RegulationFamily, mirrored
 from learning.causality_free.network import Weights
 from learning.causality_free.value import embed, query_features
 from ocp.compiled.batch import optimal_inputs, rates, running_costs
@@ -132,22 +132,22 @@ def batch_of(
     weights: Weights,
     queries: Sequence[Query],
     samples: Sequence[Samples],
-    mirrored: bool,
+    images: bool,
 ) -> Batch:
-    """Samples of queries, each with its own; with mirror images if the family has them.
+    """Samples of queries, each with its own; with mirror `images` if the family has them.
 
     The contexts are standardised as `weights` say.
     """
     parts = []
     scale = np.array(family.reach)
     signs = [np.ones(len(scale))]
-    if mirrored and family.mirror:
+    if images and family.mirror:
         signs.append(np.array(family.mirror))
     for i, (query, known) in enumerate(zip(queries, samples, strict=True)):
         P, told = regulator(query).matrix, query_features(weights, query).numpy()
         for sign in signs:
             e = known.offsets * sign
-            features, slopes = embed(query.system, e, scale)
+            features, slopes = embed(mirrored(query, sign), e, scale)
             Pe = e @ P
             quadratic = (e * Pe).sum(axis=1)
             parts.append(
@@ -168,6 +168,6 @@ def batch_of(
 def resting_inputs(family: RegulationFamily, weights: Weights, queries: Sequence[Query]) -> Tensor:
     """`[q, s + c]`, the network's inputs at every query's equilibrium."""
     n = len(family.reach)
-    rest, _ = embed(queries[0].system, np.zeros((len(queries), n)), np.array(family.reach))
+    rest = [embed(query, np.zeros((1, n)), np.array(family.reach))[0] for query in queries]
     told = torch.stack([query_features(weights, query) for query in queries])
-    return torch.cat([torch.from_numpy(rest), told], dim=1)
+    return torch.cat([torch.from_numpy(np.concatenate(rest)), told], dim=1)

@@ -200,8 +200,8 @@ def start(settings: TrainingSettings) -> TrainingState:
     family = get_family(settings.family)
     known = settings.queries - settings.held_out
     contexts = [context(family_query(family, settings.seed, k)) for k in range(known)]
-    system = family_query(family, settings.seed, 0).system
-    rest, _ = embed(system, np.zeros((1, system.n)), np.array(family.reach))
+    query = family_query(family, settings.seed, 0)
+    rest, _ = embed(query, np.zeros((1, query.system.n)), np.array(family.reach))
     weights = fresh_weights(
         rest.shape[1] + len(contexts[0]),
         settings.widths,
@@ -242,9 +242,9 @@ def train(
             tasks = gather_tasks(settings, len(state.rounds), state.weights)
             state.rounds.append(gatherer(tasks))
         joined = [Samples.joined([r[k] for r in state.rounds]) for k in range(known)]
-        data = batch_of(family, state.weights, queries[:known], joined, mirrored=True)
+        data = batch_of(family, state.weights, queries[:known], joined, images=True)
         held_out = state.rounds[0][known:]
-        unseen = batch_of(family, state.weights, queries[known:], held_out, mirrored=False)
+        unseen = batch_of(family, state.weights, queries[known:], held_out, images=False)
         total, since = 0.0, 0
         begun = time.perf_counter() - state.seconds
         while state.step < ends[number]:

@@ -19,19 +19,21 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from learning.causality_free.families import context
+from learning.causality_free.foreseen import foreseen
 from learning.causality_free.network import Weights, features_and_slopes, value_and_slope
 from ocp.query import Query
 from ocp.regulation import regulator
-from ocp.system import System
 
 Array = NDArray[np.float64]
 
 
-def embed(system: System, offsets: Array, scale: Array) -> tuple[Array, Array]:
+def embed(query: Query, offsets: Array, scale: Array) -> tuple[Array, Array]:
     """Features `[k, s]` of offsets e `[k, n]`, and their derivatives `[k, n, s]`.
 
     Coordinates are divided by `scale` `[n]`; in periodic ones sine and cosine take their place.
+    Where there are obstacles, what is foreseen of them follows.
     """
+    system = query.system
     columns, count = [], len(offsets)
     for i, period in enumerate(system.period):
         x = offsets[:, i]
@@ -45,7 +47,8 @@ def embed(system: System, offsets: Array, scale: Array) -> tuple[Array, Array]:
     slopes = np.zeros((count, system.n, len(columns)))
     for k, (i, _, slope) in enumerate(columns):
         slopes[:, i, k] = slope
-    return features, slopes
+    seen, by_state = foreseen(query, offsets)
+    return np.hstack([features, seen]), np.concatenate([slopes, by_state], axis=2)
 
 
 def query_features(weights: Weights, query: Query) -> Tensor:
@@ -83,7 +86,7 @@ class NetworkValue:
 
     def inputs(self, offsets: Array) -> tuple[Tensor, Tensor]:
         """The network's inputs `[k, s + c]` at offsets `[k, n]`; derivatives `[k, n, s + c]`."""
-        features, slopes = embed(self.query.system, offsets, self.scale)
+        features, slopes = embed(self.query, offsets, self.scale)
         q = self.told
         z = torch.cat([torch.from_numpy(features), q.expand(len(offsets), -1)], dim=1)
         none = torch.zeros((*slopes.shape[:2], len(q)), dtype=torch.float64)

@@ -1,5 +1,7 @@
 """Families: what tells queries apart, symmetries that hold, a load that is really a load."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,10 @@ from learning.causality_free.families import (
     get_family,
     loaded_quadrotor,
     merging_car,
+    mirrored,
 )
 from ocp.compiled.batch import minimised_hamiltonians, rates, state_costs
+from ocp.kernels import kernels
 from ocp.models import get_model
 from ocp.query import Goal, Query
 from ocp.regulation import regulator
@@ -41,7 +45,7 @@ def test_queries_differ_and_can_be_regulated(family) -> None:
 
 @EVERY
 def test_the_mirror_leaves_the_hamiltonian_unchanged(family) -> None:
-    """So V of the mirrored state is V: the minimised Hamiltonian determines it."""
+    """So V of the mirrored state is V among mirrored obstacles: the Hamiltonian determines it."""
     rng = np.random.default_rng(2)
     query = family.sample(rng)
     signs = np.array(family.mirror)
@@ -49,7 +53,8 @@ def test_the_mirror_leaves_the_hamiltonian_unchanged(family) -> None:
     p = rng.normal(size=x.shape)
     other = query.reference + signs * (x - query.reference)
     assert np.allclose(
-        minimised_hamiltonians(query, other, signs * p), minimised_hamiltonians(query, x, p),
+        minimised_hamiltonians(mirrored(query, signs), other, signs * p),
+        minimised_hamiltonians(query, x, p),
         rtol=1e-10, atol=1e-10,
     )  # fmt: skip
 
@@ -120,6 +125,47 @@ def test_a_car_at_rest_cannot_be_regulated_but_one_in_its_lane_can() -> None:
     query = merging_car([1.0, 1.0, 0.5, 0.3, 0.3], [0.3, 0.3], [2.0, 1.5])
     assert regulator(query).decay_rate > 0.1
     assert np.abs(rates(query, query.reference, np.zeros(2))).max() < 1e-12
+
+
+def test_obstacles_leave_the_goal_free_and_every_other_start_behind_one() -> None:
+    family = get_family("traffic")
+    rng = np.random.default_rng(6)
+    for _ in range(10):
+        query = family.sample(rng)
+        assert 1 <= len(query.obstacles) <= 3
+        assert family.why_foreign(query) is None
+        bare = replace(query, obstacles=())
+        rest = state_costs(query, query.reference) - state_costs(bare, query.reference)
+        assert 0 < rest < 1e-6
+        starts = family.starts(query, 20, rng)
+        assert (query.clearance(starts) >= 0).all()
+        ways = np.linspace(0.0, 1.0, 101)[:, None, None]
+        straight = query.reference + ways * (starts - query.reference)
+        assert ((query.clearance(straight) < 0).any(axis=0)[1::2]).mean() > 0.5
+
+
+def test_one_compiled_robot_serves_all_layouts() -> None:
+    family, rng = get_family("traffic"), np.random.default_rng(8)
+    queries = [family.sample(rng) for _ in range(8)]
+    assert len({len(q.obstacles) for q in queries}) > 1
+    assert all(kernels(q) is kernels(queries[0]) for q in queries)
+
+
+def test_obstacles_that_were_not_trained_on_are_refused() -> None:
+    family = get_family("traffic")
+    query = family.sample(np.random.default_rng(7))
+    first = query.obstacles[0]
+    hard = replace(first, hard=True)
+    for obstacles, reason in (
+        ((), "0 obstacles"),
+        ((hard,), "soft circles"),
+        ((replace(first, radius=1.0),), "radius"),
+        ((replace(first, center=(9.0, 0.0)),), "farther"),
+    ):
+        assert reason in (family.why_foreign(replace(query, obstacles=obstacles)) or "")
+    stronger = replace(query, cost=replace(query.cost, obstacle=4.0))
+    assert "penalty" in (family.why_foreign(stronger) or "")
+    assert "obstacles" in (get_family("car").why_foreign(query) or "")
 
 
 def test_what_has_no_context_is_refused() -> None:

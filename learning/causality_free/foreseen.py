@@ -1,0 +1,98 @@
+"""A layout of obstacles as a network sees it: the penalty foreseen along the regulator's motion.
+
+From the offset e the linear regulator's closed loop moves on e^(At) e, which is linear in e. The
+penalty summed over obstacles and integrated along that motion,
+
+    J_s(e) = int_0^T sum_k w exp(-b (|p(t) - c_k|^2 - r_k^2) / s^2) dt,   p(t) of e^(At) e,
+
+is for s = 1 the first-order change of the value by the obstacles (their penalty along the motion
+that is optimal without them). Wider ones, s > 1, and the same with p(t) - c_k in the integrand say
+on which side the obstacles lie. All are sums over obstacles: any number of them, in any order. They
+are smooth, their derivatives are exact, and they hardly change near the goal, where no penalty is.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ocp.query import Query
+from ocp.regulation import regulator
+
+Array = NDArray[np.float64]
+
+NODES = 48  # of the quadrature over time
+DECAYS = 4.0  # of the regulator's slowest mode, that the time lasts
+WIDTHS = (1.0, 1.6)
+SIDES = 1.6  # width of the penalty in the integrals that tell sides
+HALVES = (0.0, 0.25)  # the integrals start at these shares of the time
+
+
+@dataclass(frozen=True, eq=False)
+class _Flow:
+    """Along the regulator's motion: times' weights `[t]`, positions `[t, d, n]` of unit offsets."""
+
+    weights: Array
+    positions: Array
+
+
+@lru_cache(maxsize=256)
+def _flow(query: Query) -> _Flow:
+    lq = regulator(query).problem
+    closed = lq.A - lq.B @ regulator(query).gain()
+    times = np.linspace(0.0, DECAYS / regulator(query).decay_rate, NODES)
+    rates, modes = np.linalg.eig(closed)
+    inverse = np.linalg.inv(modes)
+    place = list(query.system.position)
+    moved = np.einsum("ij,tj,jk->tik", modes[place], np.exp(np.outer(times, rates)), inverse)
+    weights = np.full(NODES, times[1])
+    weights[[0, -1]] /= 2
+    return _Flow(weights, np.ascontiguousarray(moved.real))
+
+
+def foreseen(query: Query, offsets: Array) -> tuple[Array, Array]:
+    """Features `[k, f]` of offsets e `[k, n]` from the goal, and their derivatives `[k, n, f]`.
+
+    None (f = 0) for a query without obstacles.
+    """
+    count, n = offsets.shape
+    if not query.obstacles:
+        return np.zeros((count, 0)), np.zeros((count, n, 0))
+    flow, cost = _flow(query), query.cost
+    p = np.einsum("tdn,kn->ktd", flow.positions, offsets)
+    columns: list[Array] = []
+    slopes: list[Array] = []
+
+    def integrated(value: Array, slope: Array) -> None:
+        """A feature from its integrand `[k, t]`, and its derivative by position `[k, t, d]`."""
+        for share in HALVES:
+            weights = np.where(np.arange(NODES) >= share * NODES, flow.weights, 0.0)
+            columns.append(value @ weights)
+            slopes.append(np.einsum("ktd,t,tdn->kn", slope, weights, flow.positions))
+
+    for width in WIDTHS:
+        integrand, by_place = np.zeros(p.shape[:2]), np.zeros_like(p)
+        for gap, phi, sharp in _penalties(query, p, width):
+            integrand += phi
+            by_place -= 2 * sharp * phi[..., None] * gap
+        integrated(integrand, by_place)
+    for axis in range(p.shape[2]):
+        integrand, by_place = np.zeros(p.shape[:2]), np.zeros_like(p)
+        for gap, phi, sharp in _penalties(query, p, SIDES):
+            integrand += phi * gap[..., axis]
+            by_place -= 2 * sharp * (phi * gap[..., axis])[..., None] * gap
+            by_place[..., axis] += phi
+        integrated(integrand, by_place)
+    return np.stack(columns, axis=-1) / cost.obstacle, np.stack(slopes, axis=-1) / cost.obstacle
+
+
+def _penalties(query: Query, places: Array, width: float) -> list[tuple[Array, Array, float]]:
+    """Of every obstacle: gap `[..., d]` from its centre, penalty `[...]`, steepness."""
+    cost, found = query.cost, []
+    sharp = cost.obstacle_steepness / width**2
+    for o in query.obstacles:
+        gap = places - np.array(o.center) + query.goal_position
+        phi = cost.obstacle * np.exp(-sharp * ((gap**2).sum(axis=-1) - o.radius**2))
+        found.append((gap, phi, sharp))
+    return found
