@@ -112,7 +112,8 @@ class RegulationFamily:
 
         Where there are obstacles every second start lies behind one, seen from the goal.
         """
-        return np.array([self._start(query, k % 2 == 1, rng) for k in range(count)])
+        rows = [self._start(query, k % 2 == 1, rng) for k in range(count)]
+        return np.array(rows).reshape(count, len(self.reach))
 
     def _start(self, query: Query, behind: bool, rng: np.random.Generator) -> Array:
         reach, place = np.array(self.reach), list(query.system.position)

@@ -26,6 +26,7 @@ BENCHMARKS: dict[str, str] = {
     "navigation": "RRT-Q^X: random dynamic scenarios, rules, crowds, several robots (hours)",
     "orders": "orders of convergence of the grid schemes, on and off the axis",
     "refmm": "ReFMM: orders, refined against uniform meshes, repair against a new solve",
+    "regulation-values": "V of pendulum and cart-pole by grid, PMP, collocation, network; maps",
     "robots": "robots from SDF and URDF: evaluation and transcription, against Drake",
     "robustness": "closed loops under model error, noise, delay and saturation, every method",
     "rrtx": "RRT^X: repair after changes, against growth from scratch, OMPL and the optimum",

@@ -31,6 +31,7 @@ def test_starts_lie_in_the_robots_domain(family) -> None:
         query = family.sample(rng)
         for start in family.starts(query, 20, rng):
             query.check_start(start)
+    assert family.starts(family.sample(rng), 0, rng).shape == (0, len(family.reach))
 
 
 @EVERY
