@@ -164,13 +164,17 @@ def _stretched(query: Query, motion: Trajectory, start: Array, ratio: float) -> 
 
 
 def exact_trajectories(
-    query: Query, values: Sequence[Value], starts: ArrayLike, continuation: bool = True
+    query: Query,
+    values: Sequence[Value],
+    starts: ArrayLike,
+    continuation: bool = True,
+    ways: bool = True,
 ) -> list[Optimum | None]:
     """Exact motions from states `[k, n]`, by the first of `values` whose closed loop leads to one.
 
     Where none does, by continuation from the equilibrium, unless that is not wanted; `None` where
     that fails too. Among obstacles the cheapest of that motion and of those that pass the obstacles
-    it feels on either side.
+    it feels on either side, if such `ways` are wanted.
     """
     rows = np.atleast_2d(np.asarray(starts, dtype=float))
     found: list[Optimum | None] = [None] * len(rows)
@@ -186,7 +190,7 @@ def exact_trajectories(
             found[i] = among_growing_obstacles(query, values[-1], rows[i])
         if found[i] is None and continuation:
             found[i] = continued(query, rows[i])
-    return _cheapest_way(query, found, rows)
+    return _cheapest_way(query, found, rows) if ways else found
 
 
 def among_growing_obstacles(query: Query, value: Value, start: Array) -> Optimum | None:

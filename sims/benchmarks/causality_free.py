@@ -179,7 +179,8 @@ def _optima(query: Query, values: tuple[Any, ...], starts: Floats) -> Floats:
     """The least exact cost `[k]` that any value's closed loop leads to; NaN if none was found."""
     best = np.full(len(starts), np.inf)
     for value in values:
-        found = exact_trajectories(query, [value], starts, continuation=value is values[0])
+        first = value is values[0]
+        found = exact_trajectories(query, [value], starts, continuation=first, ways=first)
         costs = [np.inf if optimum is None else optimum.cost for optimum in found]
         best = np.minimum(best, costs)
     for i in np.flatnonzero(np.isinf(best)):

@@ -2,9 +2,9 @@
 
 Value iteration on two grids, Pontryagin's conditions by multiple shooting, collocation, and a small
 network trained without a grid on the spot (the family's weights of cost vary; the shipped query is
-met fresh). Shooting starts from closed loops and from collocation's motion, so the two share a
-guess where no loop comes to rest; their equations, meshes and quadratures are not shared. The
-error of every method is against the cheaper of the two. A slice goes through the goal in an angle
+met fresh). Shooting starts from closed loops (the regulator's, the network's, the finer grid's) and
+from collocation's motion; equations, meshes and quadratures are not shared. The error of every
+method is against the cheaper of the two. A slice goes through the goal in an angle
 and its rate; it is wider than the box that the network knows, and reaches where the pendulum's
 motor is too weak: there V has kinks, between swinging and not.
 """
@@ -30,6 +30,7 @@ from ocp.grids.regulation_grid import solve_regulation_grid
 from ocp.query import Query
 from ocp.regulation import RegulatorValue, solve_regulation
 from ocp.trajectory import SolveError
+from ocp.value import Value
 from sims.benchmarks import Report
 
 Floats = NDArray[np.float64]
@@ -46,7 +47,7 @@ class Slice:
         extent: of the slice from the goal, in them.
         nodes: an axis, odd: the goal is a node, and left out.
         box: `[n]`, half the grid's extent from the goal; empty takes the robot's domain.
-        shapes: of the grids, the finer one last.
+        shapes: of both grids, the finer one last.
     """
 
     family: str
@@ -54,7 +55,7 @@ class Slice:
     extent: tuple[float, float]
     nodes: int
     box: tuple[float, ...]
-    shapes: tuple[tuple[int, ...], ...]
+    shapes: tuple[tuple[int, ...], tuple[int, ...]]
 
 
 SLICES = (
@@ -135,11 +136,14 @@ def compare(
     timed("network", begun, learned.value(states))
     linear = RegulatorValue(query)
     values.of["linear regulator"] = linear.value(states)
-    for method, shape in zip(("grid", "finer grid"), chosen.shapes, strict=False):
+    loops: list[Value] = [linear, learned]
+    for method, shape in zip(("grid", "finer grid"), chosen.shapes, strict=True):
         notes.print(f"{chosen.family}: grid {shape}", highlight=False)
         begun = time.thread_time()
-        found = solve_regulation_grid(query, _grid(chosen, query, shape)).value(states)
+        solved = solve_regulation_grid(query, _grid(chosen, query, shape))
+        found = solved.value(states)
         timed(method, begun, np.where(np.isfinite(found), found, np.nan))
+        loops = [linear, learned, solved]
     begun, motions = time.thread_time(), []
     for k, state in enumerate(states):
         try:
@@ -151,7 +155,7 @@ def compare(
             notes.print(f"{chosen.family}: state {k} of {len(states)}", highlight=False)
     timed("collocation", begun, np.array([np.nan if m is None else m.cost for m in motions]))
     begun, costs = time.thread_time(), np.full(len(states), np.nan)
-    for value in (linear, learned):
+    for value in loops:
         found = exact_trajectories(query, [value], states, continuation=False)
         costs = np.fmin(costs, [np.nan if o is None else o.cost for o in found])
     for i, motion in enumerate(motions):
