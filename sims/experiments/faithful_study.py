@@ -225,7 +225,9 @@ def table_of(rows: Sequence[Row], title: str) -> Table:
 
 
 def _percent(number: float | None) -> str:
-    return "-" if number is None else f"{100 * number:.1f} %"
+    if number is None:
+        return "-"
+    return f"{100 * number:.1f} %" if number < 1e4 else "> 1e6 %"
 
 
 # Ablations
@@ -248,6 +250,12 @@ CHANGES: dict[str, dict[str, dict[str, Any]]] = {
     "first order": {"meta": {"second_order": False}},
     "no inner step": {"meta": {"inner_steps": 0}},
     "Adam in the adaptation": {"adaptation": {"optimizer": Optimizer.ADAM, "rate": 1e-3}},
+    "one adaptation step": {"adaptation": {"steps": 1}},
+    # The step that meta-training takes on its sum of 256 samples, whatever the number of samples.
+    "one step as meta-trained": {
+        "loss": {"reduction": Reduction.MEAN},
+        "adaptation": {"steps": 1, "rate": 0.256},
+    },
     "set-valued data": {"data": {"source": Source.SET_VALUED, "grid": COARSE}},
     "eikonal data": {"data": {"source": Source.EIKONAL}},
     "trajectories as data": {"data": {"source": Source.TRAJECTORIES}},
@@ -262,6 +270,13 @@ def changed(config: Config, change: dict[str, dict[str, Any]]) -> Config:
     return config
 
 
+def check_names(names: Sequence[str]) -> None:
+    """Raise ValueError for a change that is not in `CHANGES`."""
+    for name in names:
+        if name not in CHANGES:
+            raise ValueError(f"changes: {name!r} is unknown; known are {', '.join(CHANGES)}")
+
+
 @dataclass(frozen=True)
 class Evaluate:
     """Evaluate stored weights on fresh queries."""
@@ -270,17 +285,22 @@ class Evaluate:
     """Weights files or checkpoints."""
     counts: tuple[int, ...] = COUNTS
     """Trajectories after which to judge."""
+    changes: tuple[str, ...] = ("none",)
+    """Names in `CHANGES`, of how the weights are adapted: nothing is trained."""
     queries: int = 20
     starts: int = 10
     seed: int = 0
     json: bool = False
 
     def run(self) -> None:
+        check_names(self.changes)
         trials = fresh_trials(self.seed, self.queries, self.starts, max(self.counts))
         for path in self.weights:
             weights = MetaWeights.load(path)
-            title = f"{path}: {weights.iterations} meta-iterations"
-            show(evaluate(weights, trials, self.counts), title, self.json)
+            for name in self.changes:
+                title = f"{path}: {weights.iterations} meta-iterations; changes: {name}"
+                other = replace(weights, config=changed(weights.config, CHANGES[name]))
+                show(evaluate(other, trials, self.counts), title, self.json)
 
 
 @dataclass(frozen=True)
@@ -305,9 +325,7 @@ class Ablate:
     json: bool = False
 
     def run(self) -> None:
-        for name in self.changes:
-            if name not in CHANGES:
-                raise ValueError(f"changes: {name!r} is unknown; known are {', '.join(CHANGES)}")
+        check_names(self.changes)
         base = Config.load(self.config)
         if self.iterations:
             base = changed(base, {"meta": {"iterations": self.iterations}})
