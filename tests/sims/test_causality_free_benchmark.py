@@ -5,7 +5,6 @@ import pytest
 from learning.causality_free.families import FAMILIES
 from sims.benchmarks import causality_free
 
-
 MISSED = pytest.mark.xfail(reason="an excess of 11.8 % on these two layouts", strict=True)
 
 
