@@ -124,6 +124,8 @@ class Expressions:
             return self.module.constant(found, node.id), kind
         if isinstance(found, int | float):
             return number(found)
+        if isinstance(found, np.float32):
+            return f"{float(found)!r}f", Type("f4")
         raise self.fail(node, "unknown name")
 
     def of_Attribute(self, node: ast.Attribute) -> tuple[str, Type]:
