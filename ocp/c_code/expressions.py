@@ -124,7 +124,7 @@ class Expressions:
             return self.module.constant(found, node.id), kind
         if isinstance(found, int | float):
             return number(found)
-        if isinstance(found, np.float32):
+        if type(found) is np.float32:
             return f"{float(found)!r}f", Type("f4")
         raise self.fail(node, "unknown name")
 
