@@ -25,6 +25,7 @@ BENCHMARKS: dict[str, str] = {
     "lqr": "analytic LQR: Riccati, matrix exponential, collocation and PMP",
     "navigation": "RRT-Q^X: random dynamic scenarios, rules, crowds, several robots (hours)",
     "orders": "orders of convergence of the grid schemes, on and off the axis",
+    "reaction": "how soon adapt's plan is ready, three families, 1, 8 and 20 starts",
     "refmm": "ReFMM: orders, refined against uniform meshes, repair against a new solve",
     "regulation-values": "V of pendulum and cart-pole by grid, PMP, collocation, network; maps",
     "robots": "robots from SDF and URDF: evaluation and transcription, against Drake",

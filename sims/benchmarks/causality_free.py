@@ -33,6 +33,7 @@ from ocp.system import Coordinate
 from ocp.trajectory import SolveError
 from ocp.value import Policy, greedy
 from sims.benchmarks import Report
+from sims.benchmarks.learning import correct_optima
 from sims.closed_loop import LoopSettings, rollouts
 
 Floats = NDArray[np.float64]
@@ -149,8 +150,10 @@ def _family(
                 for kept, every in (("costs", scores[name].costs), ("optima", scores[name].optima)):
                     getattr(horizon_rivals[name], kept).extend(every[-len(drawn) :][some])
         notes.print(f"{family.name}: query {k + 1} of {queries}", highlight=False)
+    missed = correct_optima([*scores.values()], least=0.0)
     figures: dict[str, Any] = {name: score.figures() for name, score in scores.items()}
     figures["queries"] = queries
+    figures["optima_missed"] = missed
     figures["trajectories_solved"] = float(np.mean(parts["solved"]))
     figures["adaptation_adopted"] = float(np.mean(parts["adopted"]))
     figures["without_exact_cost"] = float(np.mean(parts["missing"]))

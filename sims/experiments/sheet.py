@@ -80,6 +80,8 @@ def percent(value: float | None, missing: str = "-") -> str:
     """A fraction as percent, with digits for small ones."""
     if value is None:
         return missing
+    if abs(value) >= 1e4:
+        return "over 1e6 %"
     return f"{100 * value:.2f} %" if abs(value) < 0.1 else f"{100 * value:.1f} %"
 
 

@@ -39,6 +39,7 @@ def test_a_run_that_was_stopped_goes_on(tmp_path: Path, monkeypatch) -> None:
     resumed = learning.run(0, tmp_path, queries=2, starts=2).figures["paper"]
     assert posed == [0, 1, 1]
     whole = learning.run(0, None, queries=2, starts=2).figures["paper"]
+    assert resumed.pop("optima_missed") == whole.pop("optima_missed")
     for method, figures in whole.items():
         for name in NOT_TIMES:
             assert resumed[method][name] == figures[name], (method, name)
@@ -51,3 +52,12 @@ def test_a_kept_score_is_the_score() -> None:
     again.extend(score.record())
     assert score.record()["costs"] == [1.0, None]
     assert again.figures() == score.figures()
+
+
+def test_a_loop_cheaper_than_the_optimum_becomes_the_optimum() -> None:
+    """For every method; but not within rounding, and not beside the goal."""
+    optima = [10.0, 10.0, 0.001]
+    dear = Score([10.1, 10.1, 0.001], list(optima), [False] * 3, [])
+    cheap = Score([9.0, 9.999, 0.0009], list(optima), [False] * 3, [])
+    assert learning.correct_optima([dear, cheap]) == 1
+    assert dear.optima == cheap.optima == [9.0, 10.0, 0.001]
