@@ -182,6 +182,7 @@ def _draw(name: str, rows: list[dict[str, Any]], out: Path) -> None:
     above.set_ylabel("aggregate excess over the exact cost (%)")
     above.set_ylim(bottom=floor / 1.5)
     below.set_ylabel("not reached (%)")
+    below.set_ylim(bottom=0, top=max(5.0, below.get_ylim()[1]))
     below.set_xlabel("policy ready after (ms, median)")
     for axes in (above, below):
         axes.grid(which="major", alpha=0.3)

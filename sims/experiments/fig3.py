@@ -137,13 +137,14 @@ def _judged(key: str, seed: int, k: int, starts: int, counts: tuple[int, ...]) -
 
 def _generation(seed: int, workers: int, largest: int) -> dict[str, Any]:
     """Wall seconds of n exact trajectories of fresh queries, by so many warm workers."""
-    rng = np.random.default_rng([seed, 34])
     counts = [n for n in (1, 2, 4, 8, 16, 32, 64) if n <= largest]
     times = []
     with open_door(workers, preload=PRELOAD) as door:
+        rng = np.random.default_rng([seed, 34])
         query = PAPER_FAMILY.sample(rng)
         generated(door, query, [sample_start(query, rng) for _ in range(2 * workers)])
         for n in counts:
+            rng = np.random.default_rng([seed, 34, n])  # the same work, however many share it
             runs = []
             for _ in range(3):
                 query = PAPER_FAMILY.sample(rng)
