@@ -25,7 +25,8 @@ Array = NDArray[np.float64]
 NEARBY = 0.03  # of the domain: so near to a known motion, its rest is the first guess
 REMEMBERED = 256  # motions that a policy keeps
 GUESSES = 4  # rough motions tried where no known one is near
-WEIGHT = 0.3  # of the quadratic cost at the end, 1/m^2; see `QuadraticEnd.towards_goal`
+WEIGHT = 0.3
+"""Of the quadratic cost at the end, 1/m^2: the least mean excess of `zermelo bench mpc`."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ BENCHMARKS: dict[str, str] = {
     "grids": "eikonal and set-valued grids: time, value error, closed-loop excess",
     "headline": "every headline time in one run: median, spread, ratio to a reference; memory",
     "lqr": "analytic LQR: Riccati, matrix exponential, collocation and PMP",
+    "mpc": "the receding horizon's quadratic cost at the end: what its weight does",
     "navigation": "RRT-Q^X: random dynamic scenarios, rules, crowds, several robots (hours)",
     "orders": "orders of convergence of the grid schemes, on and off the axis",
     "reaction": "how soon adapt's plan is ready, three families, 1, 8 and 20 starts",

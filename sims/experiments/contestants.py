@@ -184,7 +184,8 @@ CONTESTANTS = (
         _registered("mpc"),
         NEVER,
         "MPC",
-        note="20 steps of 0.1 s, quadratic cost at the end: 0.3 times the squared distance",
+        note="20 steps of 0.1 s, quadratic cost at the end: 0.3 times the squared distance, "
+        "the best of seven weights (zermelo bench mpc)",
     ),
     Contestant(
         "mpc-value",
