@@ -6,6 +6,7 @@ the loop's time limit; excess is over the exact cost; a collision is new if the 
 With `--out` each query is kept as it is finished, and a run that was stopped goes on.
 """
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -184,8 +185,20 @@ def correct_optima(scores: Sequence[Loops], least: float = 1.0) -> int:
 
 def kept(name: str, seed: int, out: Path | None) -> Parts:
     """Where a benchmark keeps its queries: nowhere without a folder for results."""
-    folder = None if out is None else out / name
-    return Parts(folder, {"seed": seed, "code": code_version()})
+    if out is None:
+        return Parts(None, {})
+    return Parts(
+        out / name, {"seed": seed, "code": code_version(), "learning": _learning_version()}
+    )
+
+
+def _learning_version() -> str:
+    """Digest of the learning code and of the weights that come with it."""
+    room = Path(str(resources.files("learning")))
+    digest = hashlib.sha256()
+    for path in sorted([*room.rglob("*.py"), *room.rglob("*.safetensors")]):
+        digest.update(path.relative_to(room).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def problem(family: QueryFamily, seed: int, k: int, starts: int) -> Problem:
