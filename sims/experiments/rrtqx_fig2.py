@@ -16,7 +16,7 @@ PICTURES = "rrtqx-fig2"
 def run(setting: Setting, parts: Parts) -> Findings:
     """Each controller drives once; the first one's pictures are kept beside its part."""
     controllers = CONTROLLERS[:1] if setting.quick else CONTROLLERS
-    folder = parts.folder / PICTURES
+    folder = (parts.folder or setting.out) / PICTURES
     reports = {}
     for name in controllers:
         pictures = folder if name == CONTROLLERS[0] else None
