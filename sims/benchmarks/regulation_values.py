@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -97,7 +96,6 @@ class Values:
 
 def run(seed: int, out: Path | None, slices: tuple[Slice, ...] = SLICES) -> Report:
     """Compare on every slice; draws the maps."""
-    torch.set_num_threads(1)
     report = Report()
     for chosen in slices:
         query = Query.load(Path(__file__).parent.parent / "queries" / f"{chosen.family}.toml")
