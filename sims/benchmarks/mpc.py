@@ -13,12 +13,11 @@ from rich.table import Table
 
 from ocp.mpc import WEIGHT, QuadraticEnd, receding_horizon
 from ocp.pontryagin import exact_trajectory
-from ocp.query_family import PAPER_START, paper_query
+from ocp.query_family import PAPER_GOALS, PAPER_START, paper_query
 from ocp.trajectory import SolveError
 from sims.benchmarks import Report
 from sims.closed_loop import LoopSettings, rollout
 
-GOALS = ((4.0, 4.0), (1.0, 1.0), (1.0, 4.0), (4.0, 1.0))
 WEIGHTS = (0.03, 0.1, 0.2, WEIGHT, 0.5, 1.0, 3.0)
 LOOP = LoopSettings(period=0.1, time_limit=40.0)
 
@@ -26,12 +25,12 @@ LOOP = LoopSettings(period=0.1, time_limit=40.0)
 def run(_seed: int, _out: Path | None) -> Report:
     """One table: a row for each weight."""
     start = np.array(PAPER_START)
-    optima = {goal: exact_trajectory(paper_query(goal), start).cost for goal in GOALS}
+    optima = {goal: exact_trajectory(paper_query(goal), start).cost for goal in PAPER_GOALS}
     rows: list[dict[str, Any]] = []
     for weight in WEIGHTS:
         excess: list[float | None] = []
         begun = time.thread_time()
-        for goal in GOALS:
+        for goal in PAPER_GOALS:
             query = paper_query(goal)
             policy = receding_horizon(query, QuadraticEnd.towards_goal(query, weight))
             try:
@@ -41,11 +40,11 @@ def run(_seed: int, _out: Path | None) -> Report:
             excess.append(None if cost is None else cost / optima[goal] - 1)
         rows.append({"weight": weight, "excess": excess, "seconds": time.thread_time() - begun})
     table = Table(title="receding horizon of 2 s, weight of the quadratic end: excess, four goals")
-    for column in ("weight, 1/m^2", *(f"({x:g}, {y:g})" for x, y in GOALS), "mean"):
+    for column in ("weight, 1/m^2", *(f"({x:g}, {y:g})" for x, y in PAPER_GOALS), "mean"):
         table.add_column(column, justify="right")
     for row in rows:
         known = [e for e in row["excess"] if e is not None]
-        mean = f"{np.mean(known):.1%}" if len(known) == len(GOALS) else "-"
+        mean = f"{np.mean(known):.1%}" if len(known) == len(PAPER_GOALS) else "-"
         cells = ["not reached" if e is None else f"{e:.1%}" for e in row["excess"]]
         table.add_row(f"{row['weight']:g}", *cells, mean)
     return Report({"rows": rows}, [table])

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ocp.query_family import PAPER_FIGURE_STARTS, paper_query
+from ocp.query_family import PAPER_FIGURE_STARTS, PAPER_GOALS, paper_query
 from ocp.trajectory import Status, Trajectory
 from sims.closed_loop import Rollout
 from sims.experiments import Entry, Findings, Setting
@@ -14,7 +14,6 @@ from sims.experiments.measure import judged, truth
 from sims.experiments.sheet import Sheet, number, percent
 from sims.parts import Parts
 
-GOALS = ((4.0, 4.0), (1.0, 1.0), (1.0, 4.0), (4.0, 1.0))
 """In the order of the figure's panels."""
 PREFERRED = ("adapt", "eikonal")
 PAPERS = ("faithful", "repaired")
@@ -26,7 +25,7 @@ def run(setting: Setting, parts: Parts) -> Findings:
     figures = {}
     for key in (ours, *PAPERS):
         if contestant(key).absent is None:
-            figures[key] = [_panel(key, goal, parts, setting) for goal in GOALS]
+            figures[key] = [_panel(key, goal, parts, setting) for goal in PAPER_GOALS]
     document = {
         "ours": ours,
         "absent": {c.key: c.absent for c in CONTESTANTS if c.key in PAPERS and c.absent},
