@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.obstacle import Obstacle
+from planners.checks import checked_box
+from planners.drake_geometry import drake_shape
 from planners.motion_bound import MotionBounds
 from planners.solids import Solid
-from planners.world import EdgeClearances, checked_box, drake_shape
+from planners.world import EdgeClearances
 
 # Handles that are not obstacles of the user's: the robot against itself, and whatever else the
 # model holds.

@@ -40,30 +40,25 @@ velocity for `foresight` seconds: as safe as that guess.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import Enum
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from planners.blockage import Barrier
+from planners.foretold import SHARES, ForetoldMotions
 from planners.leg import Leg, along_route
-from planners.leg_clearance import Surroundings
+from planners.leg_controller import LegController
+from planners.navigation_settings import NavigatorSettings, PaddingRule, WaypointRule
+from planners.orders import Order, Phase, Replan
 from planners.perceived import Perceived, Sighting
-from planners.rrtx import RRTX, Cause, Update
+from planners.rrtx import RRTX
+from planners.update import Cause, Update
 from planners.world import SceneWorld
 
 Array = NDArray[np.float64]
 
 SHORTEST = 0.5
 """Metres: a waypoint nearer than this is passed over."""
-SHARES = np.array([1.0, 0.85, 0.7, 0.57, 0.45, 0.35, 0.26, 0.19, 0.13, 0.08, 0.04])
-"""Of the farthest reference, those that are tried."""
-BRAKES = np.array([0.3, 0.15, 0.5, 0.0, 0.8, 1.2, -0.3, 1.8])
-"""Seconds of the present velocity ahead: references that are tried to brake to."""
-DIRECTIONS = 12
-EVASIONS = (0.4, 1.2, 3.0)
-"""Metres: how far away references are tried when braking alone is not enough."""
 RETRY = 0.5
 """Seconds between two attempts at the padding that is preferred, or at a route where none was."""
 SLACK = 0.03
@@ -72,160 +67,6 @@ SPROUTS = 40
 """At each such attempt, this part of the tree's nodes is added, until they have doubled."""
 NEWS = 0.3
 """Metres that the robot moves without a route before one is asked for again."""
-
-
-class LegController(Protocol):
-    """What drives a leg: it is handed errors x - x_r and answers with inputs.
-
-    Law: while `forecast` gives an answer, the robot does what it foretells.
-    """
-
-    @property
-    def ready(self) -> bool:
-        """Whether the robot may be sent anywhere; before, it is being learned where it stands."""
-        ...
-
-    def new_leg(self) -> None:
-        """The error is measured from another reference from now on; the horizon begins anew."""
-        ...
-
-    def control(self, error: Array) -> Array:
-        """The input `[m]` to hold until the next sample, at the error `[n]`."""
-        ...
-
-    def forecast(self, errors: Array, receding: bool) -> Array | None:
-        """Positions `[c, k, d]`, a sample a period from now on, relative to the reference.
-
-        From errors `[c, n]`, up to (almost) standstill, as if a leg began now. With `receding` the
-        horizon begins anew at every sample. `None` if the controller cannot tell.
-        """
-        ...
-
-
-class PaddingRule(Enum):
-    """What obstacles are augmented by."""
-
-    LARGEST_DEVIATION = "largest deviation so far"
-    EACH_LEG = "each leg foretold"
-
-
-class WaypointRule(Enum):
-    """How the robot goes from one waypoint to the next."""
-
-    WINDOW = "each until within its window"
-    MOVING = "a reference that runs ahead"
-
-
-class Phase(Enum):
-    """What the robot is doing."""
-
-    LEARNING = "learning where it stands"
-    DRIVING = "driving"
-    STOPPED = "stopped"
-    ARRIVED = "arrived"
-
-
-@dataclass(frozen=True)
-class Rules:
-    """Which of the paper's rules are kept."""
-
-    padding: PaddingRule
-    waypoints: WaypointRule
-
-    @property
-    def foretell(self) -> bool:
-        """Whether they need a controller that can forecast."""
-        return self.padding is PaddingRule.EACH_LEG
-
-
-PAPER = Rules(PaddingRule.LARGEST_DEVIATION, WaypointRule.WINDOW)
-FORETOLD = Rules(PaddingRule.EACH_LEG, WaypointRule.WINDOW)
-FLOWING = Rules(PaddingRule.EACH_LEG, WaypointRule.MOVING)
-
-
-@dataclass(frozen=True)
-class NavigatorSettings:
-    """A robot's numbers; lengths in metres, times in seconds.
-
-    Attributes:
-        sample_period: Delta t.
-        horizon: T.
-        admissible_window: rho.
-        goal_tolerance: of the goal.
-        perception_radius: how far the robot sees.
-        robot_radius: of its body.
-        rules: see the module.
-        margin: kept between body and obstacles by every foretold motion.
-        comfort: padding beyond the body that routes keep where there is room.
-        lead: how far the reference runs ahead at most; by default three quarters of the perception.
-        foresight: how long moving obstacles are extrapolated.
-        growth: metres a second by which bodies are extended while they change their velocity.
-        nodes: of the planner's tree.
-    """
-
-    sample_period: float = 0.05
-    horizon: float = 10.0
-    admissible_window: float = 0.15
-    goal_tolerance: float = 0.25
-    perception_radius: float = 8.0
-    robot_radius: float = 0.0
-    rules: Rules = FLOWING
-    margin: float = 0.1
-    comfort: float = 0.4
-    lead: float | None = None
-    foresight: float = 3.0
-    growth: float = 0.5
-    nodes: int = 2000
-
-    @property
-    def least_padding(self) -> float:
-        return self.robot_radius + self.margin
-
-    @property
-    def farthest(self) -> float:
-        return 0.75 * self.perception_radius if self.lead is None else self.lead
-
-
-@dataclass(frozen=True)
-class Replan:
-    """The planner was told of a change.
-
-    Attributes:
-        time: seconds.
-        causes: why.
-        seconds: wall-clock time that the planner took.
-        repaired: nodes whose cost-to-go was computed anew.
-        route: whether there is one.
-    """
-
-    time: float
-    causes: tuple[Cause, ...]
-    seconds: float
-    repaired: int
-    route: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Order:
-    """What the controller is to do until the next sample.
-
-    Attributes:
-        reference: x_r `[n]`.
-        phase: what the robot is doing.
-        reason: why it stopped; empty unless it did.
-        leg: number of the leg, from 1.
-        deviation: D_rob, metres.
-        largest_deviation: D_kin, metres.
-        padding: of the planner, metres.
-    """
-
-    reference: Array
-    phase: Phase
-    reason: str
-    leg: int
-    deviation: float
-    largest_deviation: float
-    padding: float
 
 
 @dataclass(eq=False)
@@ -278,6 +119,7 @@ class Navigator:
         self.perceived = Perceived(
             self._goal, max(padding, SHORTEST), settings.perception_radius, settings.growth
         )
+        self._foretold = ForetoldMotions(self.controller, self.perceived, settings, d)
         self.replans: list[Replan] = []
         self.phase, self.reason = Phase.LEARNING, ""
         self._update: Update = self.planner.construction
@@ -286,7 +128,6 @@ class Navigator:
         self.largest_deviation = 0.0
         self._reference = self.start.copy()
         self._retried = -np.inf
-        self._told: Array | None = None
         self._asked: tuple[float, Array] | None = None
 
     @property
@@ -424,7 +265,7 @@ class Navigator:
         # The first corner too: close to obstacles every chord past it may be barred.
         corner = min(float(np.linalg.norm(route.points[1] - route.points[0])), lead)
         ahead = along_route(route.points, np.append(SHARES * lead, corner))
-        chosen = self._farthest_clear(state, ahead)
+        chosen = self._foretold.farthest_clear(state, ahead)
         if chosen is None:
             self._brake(time, state, "no way of driving on keeps clear of the obstacles")
             return
@@ -441,106 +282,22 @@ class Navigator:
         over = self._leg_is_over(time, state) or self.phase is not Phase.DRIVING
         if not over and leg is not None and not changed and not self.perceived.moving:
             return
-        if not over and leg is not None and self._still_clear(time, state):
+        if not over and leg is not None and self._foretold.still_clear(time - leg.begun, state):
             return
         begin, end = state[: self._d], self._next_waypoint(route.points)
-        chosen = self._farthest_clear(state, begin + SHARES[:, None] * (end - begin))
+        chosen = self._foretold.farthest_clear(state, begin + SHARES[:, None] * (end - begin))
         if chosen is None:
             self._brake(time, state, "no way of driving on keeps clear of the obstacles")
             return
         self._send(time, state, self._at_rest(chosen))
         self._drive()
 
-    def _still_clear(self, time: float, state: Array) -> bool:
-        """Whether the rest of the leg's foretold motion is clear."""
-        assert self._leg is not None
-        assert self._told is not None
-        done = round((time - self._leg.begun) / self.settings.sample_period)
-        rest = self._told[min(done, len(self._told) - 1) :]
-        return bool(self._clearances(rest[None])[0] >= self._needed(state))
-
-    def _farthest_clear(self, state: Array, references: Array) -> Array | None:
-        """The first of `references` `[c, d]` that is reached clear of everything, as foretold."""
-        receding = self.settings.rules.waypoints is WaypointRule.MOVING
-        paths = self._foretell(state, references, receding)
-        settings = self.settings
-        clear = self.perceived.surroundings.first_clear(
-            paths, settings.sample_period, settings.foresight, self._needed(state)
-        )
-        if clear is None:
-            return None
-        self._told = paths[clear]
-        return references[clear]
-
     def _brake(self, time: float, state: Array, reason: str) -> None:
-        """Hold, brake or make way: the last reference if that is safe, else the safest other."""
-        p, v = state[: self._d], state[self._d : 2 * self._d]
-        needed = self._needed(state)
-        body = self.settings.robot_radius
-        held = self._reference[None, : self._d]
-        references = np.concatenate([held, p + BRAKES[:, None] * v, p + self._evasions()])
-        paths = self._foretell(state, references, True)
-        clear = self._clearances(paths)
-        ends = self._clearances(paths[:, -1:]) - body
-        stay = self.settings.least_padding - body
-        safe = clear >= needed
-        roomy = safe & (ends >= stay)
-        if self.phase is Phase.STOPPED and roomy[0]:
-            chosen = 0
-        elif roomy[1 : 1 + len(BRAKES)].any():
-            # The brake that ends soonest: least motion beyond where the robot is.
-            reach = np.linalg.norm(paths - p, axis=-1).max(axis=1)
-            reach[~roomy] = np.inf
-            chosen = 1 + int(np.argmin(reach[1 : 1 + len(BRAKES)]))
-        elif roomy.any():
-            far = np.linalg.norm(references - p, axis=1)
-            chosen = int(np.argmin(np.where(roomy, far, np.inf)))
-        else:
-            # Nothing is safe: what keeps farthest from the obstacles, or leads away from them. What
-            # moves is a guess that may not come true; what stands is not to be met for its sake.
-            certain = self._clearances(paths, self.perceived.standing())
-            spared = [certain >= needed, certain >= body, np.full(len(paths), True)]
-            allowed = next(keeps for keeps in spared if keeps.any())
-            worth = np.minimum(clear, needed) + 0.1 * np.minimum(ends, stay)
-            chosen = int(np.argmax(np.where(allowed, worth, -np.inf)))
+        stopped = self.phase is Phase.STOPPED
+        chosen = self._foretold.safest_stop(state, self._reference[: self._d], stopped)
         # While the robot stands, the horizon recedes whatever the rule: it may wait for long.
-        self._send(time, state, self._at_rest(references[chosen]), count=False)
+        self._send(time, state, self._at_rest(chosen), count=False)
         self._stop(reason)
-
-    def _evasions(self) -> Array:
-        """`[e, d]`, ways off in all directions."""
-        if self._d == 2:
-            turns = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
-            rays = np.column_stack([np.cos(turns), np.sin(turns)])
-        else:
-            grid = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * self._d)).reshape(self._d, -1).T
-            grid = grid[np.any(grid != 0, axis=1)]
-            rays = grid / np.linalg.norm(grid, axis=1, keepdims=True)
-        return np.concatenate([length * rays for length in EVASIONS])
-
-    def _foretell(self, state: Array, references: Array, receding: bool) -> Array:
-        """Positions `[c, k, d]` on the way to standstill at `references` `[c, d]`."""
-        states = np.zeros((len(references), len(state)))
-        states[:, : self._d] = references
-        told = self.controller.forecast(state - states, receding)
-        if told is None:
-            raise ValueError(
-                f"rules: {self.settings.rules.padding.value!r} needs a controller that can forecast"
-            )
-        return np.concatenate([told + references[:, None], references[:, None]], axis=1)
-
-    def _clearances(self, paths: Array, obstacles: Surroundings | None = None) -> Array:
-        """Least clearance `[c]` of motions `[c, k, d]` to `obstacles`, by default all."""
-        settings = self.settings
-        asked = self.perceived.surroundings if obstacles is None else obstacles
-        return asked.clearances(
-            paths, settings.sample_period, settings.foresight, settings.least_padding + 1.0
-        )
-
-    def _needed(self, state: Array) -> float:
-        """Clearance that a motion has to keep: no less than now, if that is already too little."""
-        here = self.perceived.clearance(state[: self._d])
-        return max(self.settings.robot_radius, min(self.settings.least_padding, here - 1e-3))
 
     # Shared.
 

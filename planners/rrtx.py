@@ -6,8 +6,6 @@ quick replanning", International Journal of Robotics Research 35 (2016).
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -15,107 +13,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.trajectory import SolveError, Status
 from planners.blockage import Blockage, find_blockage
+from planners.checks import checked_padding, checked_point
 from planners.roadmap import Roadmap
 from planners.roadmap_kernels import nearest_first, net_changes
 from planners.robot_approach import Approach
 from planners.samples import Samples
 from planners.shortcut import shortest_over_corners
 from planners.tree import Tree
-from planners.world import World, checked_padding, checked_point
+from planners.update import Cause, Route, TreeView, Update
+from planners.world import World
 
 Motion = list[float] | NDArray[np.float64] | tuple[ArrayLike, ArrayLike]
-
-
-class Cause(Enum):
-    """Why an update was made."""
-
-    GROWTH = "samples were added"
-    APPEARANCE = "obstacles appeared"
-    DISAPPEARANCE = "obstacles vanished"
-    MOVEMENT = "obstacles moved"
-    PADDING = "the padding changed"
-    ROBOT = "the robot moved"
-    GOAL = "the goal changed"
-    SETTLING = "the repair was run to its end"
-
-
-@dataclass(frozen=True)
-class Route:
-    """A way for the robot to the goal, along straight lines.
-
-    Attributes:
-        points: `[k, d]`, from the robot to the goal.
-        cost: its length.
-        certified: whether every line was proved free; else it was only sampled.
-    """
-
-    points: NDArray[np.float64]
-    cost: float
-    certified: bool
-
-
-@dataclass(frozen=True)
-class Update:
-    """What an update changed, why, and how long it took.
-
-    Attributes:
-        causes: why.
-        handles: of the obstacles that appeared, in order.
-        edges_blocked, edges_freed: edges that changed.
-        orphans: nodes that lost their way to the goal.
-        repaired: nodes made consistent.
-        settled: whether all nodes are consistent; else those farther than the robot may lag.
-        route: the robot's way now; `None` if there is none.
-        route_changed: whether it differs from before.
-        cost_before: the length of the way before; infinite if there was none.
-        blockage: what bars the way, if there is none.
-        geometry_seconds: of `seconds`, spent on distances, certificates and blockage.
-        seconds: wall-clock time of the whole update.
-    """
-
-    causes: tuple[Cause, ...]
-    handles: tuple[int, ...]
-    edges_blocked: int
-    edges_freed: int
-    orphans: int
-    repaired: int
-    settled: bool
-    route: Route | None
-    route_changed: bool
-    cost_before: float
-    blockage: Blockage | None
-    geometry_seconds: float
-    seconds: float
-
-
-@dataclass(frozen=True)
-class TreeView:
-    """The tree as it is now, for drawing; copies.
-
-    Attributes:
-        points: `[n, d]`.
-        root: the goal's node.
-        parent: `[n]`, -1 at the root and at nodes without a way.
-        cost_to_go: `[n]`, the look-ahead value; infinite at nodes without a way.
-        announced: `[n]`, the cost-to-go the neighbours last heard of (g).
-        consistent: `[n]`, whether the node waits for no repair.
-        edges, lengths, blocked: `[m, 2]`, `[m]`, `[m]`, the whole graph; the first of an edge's
-            ends is the older.
-        clearance: `[m]`, at least so far from every obstacle; infinite beyond the horizon.
-        radius: the connection radius, metres.
-    """
-
-    points: NDArray[np.float64]
-    root: int
-    parent: NDArray[np.int32]
-    cost_to_go: NDArray[np.float64]
-    announced: NDArray[np.float64]
-    consistent: NDArray[np.bool_]
-    edges: NDArray[np.int64]
-    lengths: NDArray[np.float64]
-    blocked: NDArray[np.bool_]
-    clearance: NDArray[np.float64]
-    radius: float
 
 
 class RRTX:
@@ -188,7 +96,7 @@ class RRTX:
         self._samples = Samples(world.dimension, seed)
         self._roadmap = Roadmap(
             world,
-            checked_point(world, goal, "goal"),
+            checked_point(goal, world.lower, world.upper, "goal"),
             padding,
             horizon,
             reach,
@@ -196,7 +104,9 @@ class RRTX:
             culling,
         )
         self._tree = Tree(self._roadmap, 0, epsilon)
-        self._approach = Approach(self._roadmap, checked_point(world, robot, "robot"))
+        self._approach = Approach(
+            self._roadmap, checked_point(robot, world.lower, world.upper, "robot")
+        )
         self._route: Route | None = None
         self._blockage: Blockage | None = None
         self._geometry = 0.0
@@ -304,7 +214,7 @@ class RRTX:
                 changed.append(step())
             if robot is not None:
                 causes.append(Cause.ROBOT)
-                self._approach.move(checked_point(world, robot, "robot"))
+                self._approach.move(checked_point(robot, world.lower, world.upper, "robot"))
         finally:
             if changed:
                 self._approach.forget()
@@ -347,7 +257,7 @@ class RRTX:
     def set_goal(self, goal: ArrayLike, to_the_end: bool = False) -> Update:
         """Root the tree at a new goal `[d]`; the graph and its clearances stay."""
         begun = time.perf_counter()
-        point = checked_point(self.world, goal, "goal")
+        point = checked_point(goal, self.world.lower, self.world.upper, "goal")
         same = np.flatnonzero((self._roadmap.points == point).all(axis=1))
         if len(same):
             root = int(same[0])

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ocp.obstacle import Obstacle
+from planners.checks import checked_box
 from planners.clearance_kernels import ball_clearances, edges_within, polytope_clearances
+from planners.drake_geometry import Lens, in_space
 from planners.solids import Shape, Solid
 
 # Distances of the engine are good to 1e-12 at these sizes; whatever is closer than this to the
@@ -160,10 +162,10 @@ class SceneWorld:
             raise ValueError(f"lower: a scene has 2 or 3 coordinates, got {len(self.lower)}")
         self._graph = SceneGraph()
         self._source = self._graph.RegisterSource("obstacles")
-        self._scene = _Lens(self._graph, self._source)
+        self._scene = Lens(self._graph, self._source)
         self._look_ahead = LOOK_AHEAD * float((self.upper - self.lower).max())
         self._solids: dict[int, Solid] = {}
-        self._lenses: dict[int, _Lens] = {}
+        self._lenses: dict[int, Lens] = {}
         self._ids: dict[int, Any] = {}
         self._owners: dict[Any, int] = {}
         self._next = 0
@@ -244,7 +246,7 @@ class SceneWorld:
         gradient = np.zeros(flat.shape)
         handle = np.full(len(flat), -1)
         query = self._scene.query.ComputeSignedDistanceToPoint
-        for i, point in enumerate(_in_space(flat)):
+        for i, point in enumerate(in_space(flat)):
             answers = query(point, within)
             if answers:
                 nearest = min(answers, key=_distance)
@@ -294,7 +296,7 @@ class SceneWorld:
         farther than is worth the answers) and the half-planes of the gradients say how far
         the segment is free for certain, and the next question is asked there.
         """
-        first, last = _in_space(starts), _in_space(ends)
+        first, last = in_space(starts), in_space(ends)
         query = self._scene.query.ComputeSignedDistanceToPoint
         free = np.zeros(len(first), dtype=bool)
         level = padding + TOLERANCE
@@ -328,7 +330,7 @@ class SceneWorld:
             raise ValueError(f"handle: no obstacle {handle}; present are {list(self._solids)}")
 
     def _register(self, handle: int, solid: Solid) -> None:
-        lens = _Lens(self._graph, self._source)
+        lens = Lens(self._graph, self._source)
         lens.add(solid, f"obstacle {handle}")
         identity = self._scene.add(solid, f"obstacle {handle}")
         self._lenses[handle] = lens
@@ -370,116 +372,11 @@ class SceneWorld:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Distance `[k]` and gradient `[k, d]` to one obstacle."""
         query = self._lenses[handle].query.ComputeSignedDistanceToPoint
-        answers = [query(point, np.inf)[0] for point in _in_space(points)]
+        answers = [query(point, np.inf)[0] for point in in_space(points)]
         distance = np.array([a.distance for a in answers])
         gradient = np.array([a.grad_W for a in answers]).reshape(-1, 3)
         return distance, np.ascontiguousarray(gradient[:, : self.dimension])
 
 
-class _Lens:
-    """A context of the scene graph, and the geometry in it."""
-
-    def __init__(self, graph: Any, source: Any) -> None:
-        self._graph, self._source = graph, source
-        self._context = graph.CreateDefaultContext()
-        self.query = graph.get_query_output_port().Eval(self._context)
-
-    def add(self, solid: Solid, name: str) -> Any:
-        """Register the solid. Returns Drake's identity of it."""
-        from pydrake.geometry import GeometryInstance, ProximityProperties
-        from pydrake.math import RigidTransform, RotationMatrix
-
-        rotation = np.eye(3)
-        rotation[: solid.dimension, : solid.dimension] = solid.rotation
-        pose = RigidTransform(RotationMatrix(rotation), _in_space(solid.center[None])[0])
-        instance = GeometryInstance(pose, drake_shape(solid), name)
-        instance.set_proximity_properties(ProximityProperties())
-        identity = self._graph.RegisterGeometry(
-            self._context, self._source, self._graph.world_frame_id(), instance
-        )
-        self.query = self._graph.get_query_output_port().Eval(self._context)
-        return identity
-
-    def remove(self, identity: Any) -> None:
-        self._graph.RemoveGeometry(self._context, self._source, identity)
-        self.query = self._graph.get_query_output_port().Eval(self._context)
-
-
-def drake_shape(solid: Solid, height: float | None = None) -> Any:
-    """The solid as a Drake shape about its centre; a cylinder or prism if it is of the plane.
-
-    Args:
-        height: of the cylinder or prism, metres; by default four times the solid's reach.
-    """
-    from pydrake.geometry import Box, Convex, Cylinder, Sphere
-
-    height = 4 * solid.reach if height is None else height
-    if solid.shape is Shape.BALL:
-        return Sphere(solid.radius) if solid.dimension == 3 else Cylinder(solid.radius, height)
-    if solid.shape is Shape.BOX:
-        return Box(*(solid.bounds[1] - solid.bounds[0]))
-    corners = solid.corners
-    if solid.dimension == 2:
-        levels = np.repeat([-height / 2, height / 2], len(corners))
-        corners = np.column_stack([np.tile(corners, (2, 1)), levels])
-    return Convex(corners.T.copy(), solid.shape.value)  # pyright: ignore[reportCallIssue, reportArgumentType]
-
-
-def checked_box(
-    lower: ArrayLike, upper: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The corners `[d]` of a box with an interior, as arrays.
-
-    Raises:
-        ValueError: if they do not fit each other, or leave no interior.
-    """
-    a, b = np.array(lower, dtype=float), np.array(upper, dtype=float)
-    if a.ndim != 1 or a.shape != b.shape or not 2 <= len(a) <= 7:
-        raise ValueError(
-            "lower, upper: must be lists of the same 2 to 7 numbers of coordinates, "
-            f"got shapes {a.shape} and {b.shape}"
-        )
-    if not (np.isfinite(a).all() and np.isfinite(b).all() and (b > a).all()):
-        raise ValueError(
-            f"upper: must be finite and exceed lower, got {b.tolist()} over {a.tolist()}"
-        )
-    return a, b
-
-
-def _in_space(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`[k, 3]` from `[k, 2 or 3]`."""
-    if points.shape[1] == 3:
-        return points
-    return np.column_stack([points, np.zeros(len(points))])
-
-
 def _distance(answer: Any) -> float:
     return answer.distance
-
-
-def checked_padding(padding: float) -> float:
-    """The padding, if it is a finite number of at least 0.
-
-    Raises:
-        ValueError: if it is not.
-    """
-    if not (np.isfinite(padding) and padding >= 0):
-        raise ValueError(f"padding: must be a finite number of at least 0, got {padding}")
-    return float(padding)
-
-
-def checked_point(world: World, point: ArrayLike, name: str) -> NDArray[np.float64]:
-    """The point `[d]`, if it lies in the world's box.
-
-    Raises:
-        ValueError: if it does not.
-    """
-    array = np.array(point, dtype=float)
-    if array.shape != (world.dimension,):
-        raise ValueError(f"{name}: must be {world.dimension} coordinates, got {array.tolist()}")
-    if not ((array >= world.lower) & (array <= world.upper)).all():
-        raise ValueError(
-            f"{name}: must be finite and lie between {world.lower.tolist()} and "
-            f"{world.upper.tolist()}, got {array.tolist()}"
-        )
-    return array

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from planners.rrtx import RRTX, Update
+from planners.rrtx import RRTX
 from planners.solids import Solid
+from planners.update import Update
 from planners.world import SceneWorld
 from sims.benchmarks.rrtx_maps import HALF, obstacles_20
 from sims.benchmarks.visibility_graph import shortest_way

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from ocp.query import Query
 from ocp.trajectory import Trajectory
 from ocp.value import Value
+from planners.drake_geometry import drake_shape
 from planners.solids import Solid
-from planners.world import drake_shape
 from sims.pictures.plan_figure import (
     CLOSED_LOOP,
     GOAL,

@@ -1,4 +1,4 @@
-"""The controllers that drive legs: they satisfy `planners.rrt_qx.LegController`.
+"""The controllers that drive legs: they satisfy `planners.leg_controller.LegController`.
 
 All but `ExactController` know nothing of the plant; what the simulator tells them (how hard to
 probe, what holds the robot where it stands) is what a driver would know.
@@ -15,7 +15,7 @@ from learning.q_learning.learner import LearnerSettings, QLearner
 from learning.q_learning.paper_law import LITERAL, REPAIRED, PaperLaw, PaperSettings
 from learning.q_learning.quadratic_cost import QuadraticCost
 from ocp.riccati import LinearQuadratic, differential_riccati
-from planners.rrt_qx import LegController
+from planners.leg_controller import LegController
 from sims.navigation.plants import Plant
 from sims.regulation.simulation import LinearPlant
 

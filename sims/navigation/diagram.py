@@ -13,7 +13,8 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.primitives import LinearSystem, Multiplexer
 
-from planners.rrt_qx import Navigator, Order, Phase
+from planners.orders import Order, Phase
+from planners.rrt_qx import Navigator
 from sims.navigation.controllers import Driver
 from sims.navigation.record import Recorder
 from sims.navigation.scenario_file import Scenario

@@ -14,7 +14,7 @@ from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
 
 from ocp.files import atomic_path
-from planners.rrt_qx import Phase
+from planners.orders import Phase
 from planners.solids import Shape, Solid
 from sims.navigation.navigate import Navigation
 from sims.navigation.record import Moment

@@ -7,15 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planners.rrt_qx import (
-    FLOWING,
-    PAPER,
-    Navigator,
-    NavigatorSettings,
-    Phase,
-    Rules,
-)
-from planners.rrtx import Cause
+from planners.navigation_settings import FLOWING, PAPER, NavigatorSettings, Rules
+from planners.orders import Phase
+from planners.rrt_qx import Navigator
+from planners.update import Cause
 from sims.navigation.controllers import (
     CONTROLLERS,
     Driver,
@@ -23,7 +18,8 @@ from sims.navigation.controllers import (
     make_controller,
 )
 from sims.navigation.record import Moment, Recorder
-from sims.navigation.scenario_file import Robot, Scenario
+from sims.navigation.scenario_file import Scenario
+from sims.navigation.scenario_parts import Robot
 
 Array = NDArray[np.float64]
 

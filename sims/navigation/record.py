@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planners.rrt_qx import Navigator, Order
-from planners.rrtx import TreeView
+from planners.orders import Order
+from planners.rrt_qx import Navigator
 from planners.solids import Solid
+from planners.update import TreeView
 
 Array = NDArray[np.float64]
 

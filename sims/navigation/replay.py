@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ocp.files import write_text
+from planners.drake_geometry import drake_shape
 from planners.solids import Solid
-from planners.world import drake_shape
 from sims.navigation.navigate import Navigation
 from sims.navigation.record import Moment
 from sims.navigation.scenario_file import Scenario

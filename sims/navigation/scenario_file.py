@@ -2,9 +2,8 @@
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from learning.q_learning.quadratic_cost import QuadraticCost
 from ocp.query_file import read_toml
-from planners.solids import Shape, Solid
-from sims.navigation.plants import PLANTS, Plant
-from sims.regulation.system_file import need_controllable
+from sims.navigation.scenario_parts import (
+    WEIGHTS,
+    Robot,
+    Visitor,
+    gap,
+    read_robot,
+    read_visitor,
+)
+from sims.toml_tables import (
+    number_of,
+    numbers_of,
+    positive,
+    refuse_unknown,
+    table_of,
+    tables_of,
+)
 
 Array = NDArray[np.float64]
 
@@ -33,49 +44,6 @@ OPTIONS = {
 """Numbers of a scenario and their defaults: the paper's, where it gives one."""
 TOP = {"plant", "start", "goal", "robot_radius", "arena", "weights", "obstacle", "robot", *OPTIONS}
 ROBOT = {"plant", "start", "goal", "robot_radius"}
-WEIGHTS = {"M": 10.0, "R": 2.0, "terminal": 0.5}
-
-
-@dataclass(frozen=True, eq=False)
-class Visitor:
-    """An obstacle, and when it is there.
-
-    Attributes:
-        solid: where it is when it appears.
-        appears, vanishes: seconds.
-        velocity: `[d]`, metres a second, from when it appears.
-    """
-
-    solid: Solid
-    appears: float
-    vanishes: float
-    velocity: Array
-
-    @cached_property
-    def moves(self) -> bool:
-        return bool(np.any(self.velocity != 0))
-
-
-@dataclass(frozen=True, eq=False)
-class Robot:
-    """One robot of a scenario.
-
-    Attributes:
-        plant: what it is; it does not know.
-        start, goal: `[d]`, metres; it begins and is to end at rest.
-        radius: metres, of its body.
-        cost: what its legs minimise.
-    """
-
-    plant: Plant
-    start: Array
-    goal: Array
-    radius: float
-    cost: QuadraticCost
-
-    def at_rest(self, position: Array) -> Array:
-        """The state `[n]` at rest at `position` `[d]`."""
-        return np.concatenate([position, np.zeros(self.plant.n - len(position))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +78,8 @@ class Scenario:
 
     def __post_init__(self) -> None:
         for name in ("perception_radius", "goal_tolerance", "horizon", "sample_period"):
-            _positive(getattr(self, name), name)
-        _positive(self.time_limit, "time_limit")
+            positive(getattr(self, name), name)
+        positive(self.time_limit, "time_limit")
         if not 0 < self.admissible_window < 1:
             raise ValueError(
                 f"admissible_window: must lie between 0 and 1, got {self.admissible_window:g}"
@@ -167,33 +135,33 @@ class Scenario:
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> "Scenario":
         """The scenario of a file's tables; unknown keys are refused."""
-        _only(table, "", TOP)
+        refuse_unknown(table, "", TOP)
         for key in ("plant", "start", "goal"):
             if key not in table:
                 raise ValueError(f"{key}: missing")
-        options = {k: _number(table[k], k) for k in OPTIONS if k in table}
-        horizon = _positive(options.get("horizon", OPTIONS["horizon"]), "horizon")
-        weights = _table(table.get("weights", {}), "weights", set(WEIGHTS))
-        first = _robot(table, "", table["plant"], 0.0, weights, horizon)
+        options = {k: number_of(table[k], k) for k in OPTIONS if k in table}
+        horizon = positive(options.get("horizon", OPTIONS["horizon"]), "horizon")
+        weights = table_of(table.get("weights", {}), "weights", set(WEIGHTS))
+        first = read_robot(table, "", table["plant"], 0.0, weights, horizon)
         d = len(first.start)
         lower, upper = _arena(table.get("arena", {}), d)
         others = [
-            _robot(
-                _table(entry, f"robot {k}", ROBOT),
+            read_robot(
+                table_of(entry, f"robot {k}", ROBOT),
                 f"robot {k}.",
                 table["plant"],
                 first.radius,
                 weights,
                 horizon,
             )
-            for k, entry in enumerate(_tables(table, "robot"), 1)
+            for k, entry in enumerate(tables_of(table, "robot"), 1)
         ]
         for k, robot in enumerate(others, 1):
             if len(robot.start) != d:
                 raise ValueError(f"robot {k}.start: must have {d} coordinates like start")
         visitors = tuple(
-            _visitor(_table(entry, f"obstacle {k}", None), f"obstacle {k}", d)
-            for k, entry in enumerate(_tables(table, "obstacle"), 1)
+            read_visitor(table_of(entry, f"obstacle {k}", None), f"obstacle {k}", d)
+            for k, entry in enumerate(tables_of(table, "obstacle"), 1)
         )
         return cls((first, *others), lower, upper, visitors, **options)
 
@@ -204,115 +172,11 @@ def shipped_scenarios() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
-def gap(solid: Solid, point: Array) -> float:
-    """Metres between a solid and `point` `[d]`; at most 0 inside, a lower bound in space."""
-    if solid.shape is Shape.BALL:
-        return float(np.linalg.norm(point - solid.center)) - solid.radius
-    outside = solid.facets[:, :-1] @ point + solid.facets[:, -1]
-    if outside.max() <= 0 or solid.dimension == 3:
-        return float(outside.max())
-    a, b = solid.sides[:, 0], solid.sides[:, 1]
-    along = b - a
-    t = np.clip(((point - a) * along).sum(axis=1) / (along**2).sum(axis=1), 0.0, 1.0)
-    return float(np.linalg.norm(a + t[:, None] * along - point, axis=1).min())
-
-
-def _robot(
-    table: Mapping[str, Any],
-    prefix: str,
-    plant_by_default: Any,
-    radius: float,
-    weights: Mapping[str, Any],
-    horizon: float,
-) -> Robot:
-    for key in ("start", "goal"):
-        if key not in table:
-            raise ValueError(f"{prefix}{key}: missing")
-    start = _numbers(table["start"], f"{prefix}start")
-    plant = _plant(table.get("plant", plant_by_default), f"{prefix}plant", len(start))
-    goal = _numbers(table["goal"], f"{prefix}goal")
-    for name, point in (("start", start), ("goal", goal)):
-        if len(point) != plant.dimension:
-            raise ValueError(
-                f"{prefix}{name}: must have {plant.dimension} coordinates for {plant.name}, "
-                f"got {point.tolist()}"
-            )
-    own = _number(table.get("robot_radius", radius), f"{prefix}robot_radius")
-    if not own >= 0:
-        raise ValueError(f"{prefix}robot_radius: must be at least 0, got {own:g}")
-    return Robot(plant, start, goal, own, _cost(weights, plant, horizon))
-
-
-def _plant(value: Any, name: str, d: int) -> Plant:
-    if isinstance(value, str):
-        if value not in PLANTS:
-            raise ValueError(
-                f"{name}: {value!r} is unknown; known are {', '.join(PLANTS)}, or a table with A, B"
-            )
-        return PLANTS[value]()
-    table = _table(value, name, {"A", "B", "anchored", "probing", "behaviour_gain"})
-    for key in ("A", "B"):
-        if key not in table:
-            raise ValueError(f"{name}.{key}: missing")
-    A, B = _rows(table["A"], f"{name}.A"), _rows(table["B"], f"{name}.B")
-    n, m = len(A), B.shape[1]
-    if A.shape != (n, n):
-        raise ValueError(f"{name}.A: must be square, got {A.shape[0]} x {A.shape[1]}")
-    if len(B) != n:
-        raise ValueError(f"{name}.B: must have {n} rows like A, got {len(B)}")
-    if d not in (2, 3) or n < d:
-        raise ValueError(
-            f"{name}.A: the first states are the position, as start has them ({d}); got {n} states"
-        )
-    anchored = table.get("anchored", False)
-    if not isinstance(anchored, bool):
-        raise ValueError(f"{name}.anchored: must be true or false, got {anchored!r}")
-    probing = _positive(_number(table.get("probing", 2.0), f"{name}.probing"), f"{name}.probing")
-    gain = np.zeros((m, n))
-    if "behaviour_gain" in table:
-        gain = _rows(table["behaviour_gain"], f"{name}.behaviour_gain")
-        if gain.shape != (m, n):
-            raise ValueError(f"{name}.behaviour_gain: must be {m} rows of {n} numbers")
-    try:
-        need_controllable(A, B)
-    except ValueError as error:
-        raise ValueError(f"{name}.{error}") from error
-    plant = Plant("system", A, B, d, anchored, probing, gain)
-    if not anchored:
-        # Every place must be one where the robot can stand still.
-        rest = np.vstack([np.eye(d), np.zeros((n - d, d))])
-        left = A @ rest + B @ np.linalg.lstsq(B, -A @ rest, rcond=None)[0]
-        if np.abs(left).max() > 1e-9 * max(1.0, np.abs(A).max()):
-            raise ValueError(
-                f"{name}.A: no input holds this robot at rest away from the origin; "
-                "with anchored = true it is simulated in error coordinates"
-            )
-    return plant
-
-
-def _cost(weights: Mapping[str, Any], plant: Plant, horizon: float) -> QuadraticCost:
-    matrices = {}
-    for key, default in WEIGHTS.items():
-        size = plant.m if key == "R" else plant.n
-        matrices[key] = default * np.eye(size)
-        if key in weights:
-            matrices[key] = _rows(weights[key], f"weights.{key}")
-            if matrices[key].shape != (size, size):
-                raise ValueError(
-                    f"weights.{key}: must be {size} x {size} for {plant.name}, "
-                    f"got {len(matrices[key])} x {matrices[key].shape[1]}"
-                )
-    try:
-        return QuadraticCost(matrices["M"], matrices["R"], matrices["terminal"], horizon)
-    except ValueError as error:
-        raise ValueError(f"weights.{error}") from error
-
-
 def _arena(value: Any, d: int) -> tuple[Array, Array]:
-    table = _table(value, "arena", {"lower", "upper"})
+    table = table_of(value, "arena", {"lower", "upper"})
     corners = {"lower": np.full(d, -ARENA_HALF), "upper": np.full(d, ARENA_HALF)}
     for key in table:
-        corners[key] = _numbers(table[key], f"arena.{key}")
+        corners[key] = numbers_of(table[key], f"arena.{key}")
         if len(corners[key]) != d:
             raise ValueError(
                 f"arena.{key}: must have {d} coordinates like start, got {corners[key].tolist()}"
@@ -323,96 +187,3 @@ def _arena(value: Any, d: int) -> tuple[Array, Array]:
             f"{corners['lower'].tolist()}"
         )
     return corners["lower"], corners["upper"]
-
-
-def _visitor(table: Mapping[str, Any], name: str, d: int) -> Visitor:
-    timing = {"appears", "vanishes", "velocity"}
-    forms = {
-        frozenset({"vertices"}): "vertices",
-        frozenset({"center", "radius"}): "ball",
-        frozenset({"lower", "upper"}): "box",
-    }
-    shape = frozenset(table) - timing
-    _only(table, f"{name}.", timing.union(*forms))
-    if shape not in forms:
-        raise ValueError(
-            f"{name}: must have either vertices, or center and radius, or lower and upper, "
-            f"got {', '.join(sorted(shape)) or 'none of them'}"
-        )
-    try:
-        if forms[shape] == "vertices":
-            vertices = _rows(table["vertices"], "vertices")
-            solid = Solid.polygon(vertices) if d == 2 else Solid.hull(vertices)
-        elif forms[shape] == "ball":
-            solid = Solid.ball(
-                _numbers(table["center"], "center"), _number(table["radius"], "radius")
-            )
-        else:
-            solid = Solid.box(_numbers(table["lower"], "lower"), _numbers(table["upper"], "upper"))
-    except ValueError as error:
-        raise ValueError(f"{name}.{error}") from error
-    if solid.dimension != d:
-        raise ValueError(f"{name}: must have {d} coordinates like start, got {solid.dimension}")
-    appears = _number(table.get("appears", 0.0), f"{name}.appears")
-    vanishes = _number(table.get("vanishes", math.inf), f"{name}.vanishes")
-    if not 0 <= appears < math.inf:
-        raise ValueError(f"{name}.appears: must be a time of at least 0 s, got {appears:g}")
-    if not vanishes > appears:
-        raise ValueError(f"{name}.vanishes: must be later than it appears, got {vanishes:g}")
-    velocity = np.zeros(d)
-    if "velocity" in table:
-        velocity = _numbers(table["velocity"], f"{name}.velocity")
-        if len(velocity) != d:
-            raise ValueError(f"{name}.velocity: must have {d} coordinates, got {velocity.tolist()}")
-    return Visitor(solid, appears, vanishes, velocity)
-
-
-def _tables(table: Mapping[str, Any], key: str) -> list[Any]:
-    entries = table.get(key, [])
-    if not isinstance(entries, list):
-        raise ValueError(f"{key}: must be an array of tables, [[{key}]]")
-    return entries
-
-
-def _only(table: Mapping[str, Any], prefix: str, known: set[str] | frozenset[str]) -> None:
-    for key in table:
-        if key not in known:
-            raise ValueError(f"{prefix}{key}: unknown; known are {', '.join(sorted(known))}")
-
-
-def _table(value: Any, name: str, known: set[str] | None) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{name}: must be a table, got {value!r}")
-    if known is not None:
-        _only(value, f"{name}.", known)
-    return value
-
-
-def _number(value: Any, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
-        raise ValueError(f"{name}: must be a number, got {value!r}")
-    return float(value)
-
-
-def _positive(value: float, name: str) -> float:
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{name}: must be positive and finite, got {value:g}")
-    return value
-
-
-def _numbers(value: Any, name: str) -> Array:
-    if not isinstance(value, Sequence) or isinstance(value, str) or not value:
-        raise ValueError(f"{name}: must be a list of numbers, got {value!r}")
-    array = np.array([_number(v, name) for v in value])
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}: numbers must be finite, got {value!r}")
-    return array
-
-
-def _rows(value: Any, name: str) -> Array:
-    if not isinstance(value, Sequence) or isinstance(value, str) or not value:
-        raise ValueError(f"{name}: must be a list of rows of numbers, got {value!r}")
-    rows = [_numbers(row, name) for row in value]
-    if len({len(row) for row in rows}) != 1:
-        raise ValueError(f"{name}: rows must be of equal length, got {value!r}")
-    return np.array(rows)

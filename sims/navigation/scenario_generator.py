@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planners.solids import Solid
-from sims.navigation.scenario_file import Scenario, gap
+from sims.navigation.scenario_file import Scenario
+from sims.navigation.scenario_parts import gap
 
 Array = NDArray[np.float64]
 

@@ -17,10 +17,11 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, LeafSystem
 
+from planners.drake_geometry import drake_shape
 from planners.perceived import Sighting
 from planners.solids import Solid
-from planners.world import drake_shape
-from sims.navigation.scenario_file import Scenario, Visitor, gap
+from sims.navigation.scenario_file import Scenario
+from sims.navigation.scenario_parts import Visitor, gap
 
 Array = NDArray[np.float64]
 

@@ -18,15 +18,15 @@ from rich.console import Console
 from rich.table import Table
 
 from ocp.query_file import read_toml
-from planners.rrt_qx import (
+from planners.navigation_settings import (
     FLOWING,
     FORETOLD,
     PAPER,
     NavigatorSettings,
-    Phase,
     Rules,
     WaypointRule,
 )
+from planners.orders import Phase
 from sims.benchmarks.visibility_graph import shortest_way
 from sims.navigation.controllers import ExactController
 from sims.navigation.navigate import FORESEEING, Navigation, run

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from planners.drake_geometry import drake_shape
 from planners.rrtx import RRTX
 from planners.solids import Solid
-from planners.world import SceneWorld, drake_shape
+from planners.world import SceneWorld
 
 HEIGHT = 1.0
 

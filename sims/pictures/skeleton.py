@@ -17,8 +17,8 @@ from ocp.files import write_text
 from ocp.models.multibody import MultibodyModel
 from ocp.obstacle import Obstacle
 from ocp.trajectory import Trajectory
+from planners.drake_geometry import drake_shape
 from planners.solids import Solid
-from planners.world import drake_shape
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from pydrake.multibody.plant import CoulombFriction
 from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
 from pydrake.planning import RobotDiagramBuilder, SceneGraphCollisionChecker
 
+from planners.drake_geometry import drake_shape
 from planners.solids import Solid
-from planners.world import drake_shape
 
 
 class PaddedChecker:

@@ -6,7 +6,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from ocp.obstacle import Obstacle
-from planners.rrtx import RRTX, TreeView
+from planners.rrtx import RRTX
+from planners.update import TreeView
 
 
 def costs_by_dijkstra(view: TreeView, one_way: NDArray[np.bool_] | None = None) -> NDArray:

@@ -4,17 +4,12 @@ import numpy as np
 import pytest
 
 from planners.leg import Leg
+from planners.navigation_settings import FLOWING, FORETOLD, PAPER, NavigatorSettings
+from planners.orders import Phase
 from planners.perceived import Sighting
-from planners.rrt_qx import (
-    FLOWING,
-    FORETOLD,
-    PAPER,
-    Navigator,
-    NavigatorSettings,
-    Phase,
-)
-from planners.rrtx import Cause
+from planners.rrt_qx import Navigator
 from planners.solids import Solid
+from planners.update import Cause
 from planners.world import SceneWorld
 
 PERIOD = 0.05

@@ -13,8 +13,9 @@ from oracles import check_costs, check_tree, clearance_by_search, costs_by_dijks
 from ocp.obstacle import Obstacle
 from ocp.trajectory import SolveError
 from planners.blockage import Barrier
-from planners.rrtx import RRTX, Cause
+from planners.rrtx import RRTX
 from planners.solids import Solid
+from planners.update import Cause
 from planners.world import SceneWorld
 from sims.benchmarks.visibility_graph import shortest_way
 

@@ -7,10 +7,12 @@ import sys
 import numpy as np
 import pytest
 
-from planners.rrt_qx import FLOWING, PAPER, Phase
+from planners.navigation_settings import FLOWING, PAPER
+from planners.orders import Phase
 from sims.navigation.navigate import document, navigate, run
-from sims.navigation.scenario_file import Scenario, gap
+from sims.navigation.scenario_file import Scenario
 from sims.navigation.scenario_generator import load, random_crowd, random_scenario, random_team
+from sims.navigation.scenario_parts import gap
 from sims.regulation.simulation import LinearPlant
 
 KEYS = {

@@ -11,7 +11,8 @@ import pytest
 
 from planners.solids import Solid
 from sims.navigation.plants import PLANTS
-from sims.navigation.scenario_file import Scenario, gap, shipped_scenarios
+from sims.navigation.scenario_file import Scenario, shipped_scenarios
+from sims.navigation.scenario_parts import gap
 
 GOOD = {
     "plant": "springless-rover",
