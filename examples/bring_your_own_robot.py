@@ -11,7 +11,7 @@ from ocp.cost import RunningCost
 from ocp.models.drake_adaptors import StateFeedback
 from ocp.models.multibody import multibody_model
 from ocp.query import Equilibrium
-from ocp.regulation import RegulationValue
+from ocp.regulation_value import RegulationValue
 
 robot = multibody_model(Path(__file__).parent / "furuta.sdf")
 weights = ((1.0, 0, 0, 0), (0, 5.0, 0, 0), (0, 0, 0.1, 0), (0, 0, 0, 0.1))

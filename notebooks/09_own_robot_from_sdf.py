@@ -31,7 +31,8 @@ from ocp.compiled.batch import rates
 from ocp.models.multibody import multibody_model
 from ocp.oracle import consult
 from ocp.query import Equilibrium
-from ocp.regulation import RegulationValue, regulator
+from ocp.regulation import regulator
+from ocp.regulation_value import RegulationValue
 from sims.closed_loop import LoopSettings, drake_rollout
 from sims.pictures.skeleton import OBLIQUE, Skeleton, draw_strobe, save_robot_replay
 

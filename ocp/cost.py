@@ -14,8 +14,10 @@ Every function takes CasADi symbols or numbers, so that one definition serves IP
 the compiled kernels (parameters).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -119,9 +121,17 @@ def quadratic_cost(
     return ca.bilin(matrix, wrapped, wrapped) + total
 
 
+def circle_penalty(distance_squared, radius, weight, steepness, exp: Callable[..., Any]) -> Any:
+    """phi of a circle at a squared distance from its centre, in symbols or arrays: `exp` is theirs.
+
+    Its derivative by the squared distance is -steepness phi.
+    """
+    return weight * exp(-steepness * (distance_squared - radius**2))
+
+
 def ball_penalty(position: Expression, center: Expression, radius, weight, steepness) -> ca.SX:
     """phi of a circle: 1 on its boundary, exp(b r^2) at its centre."""
-    return weight * ca.exp(-steepness * (ca.sumsqr(position - center) - radius**2))
+    return circle_penalty(ca.sumsqr(position - center), radius, weight, steepness, ca.exp)
 
 
 def facet_penalty(

@@ -22,7 +22,7 @@ SHAPES = {"circle": Obstacle.circle, "diamond": Obstacle.diamond}
 
 
 def load_family(name: str | os.PathLike[str]) -> QueryFamily:
-    """A family by name (`paper`, `general`) or from a family file.
+    """A family by name (`paper`, `general`, `paper-1-1`: one query alone) or from a family file.
 
     Raises:
         ValueError: if it is unknown or a field is wrong; the message names the field.
@@ -32,9 +32,14 @@ def load_family(name: str | os.PathLike[str]) -> QueryFamily:
     shipped = resources.files("ocp.families") / f"{name}.toml"
     if not Path(name).suffix:
         if not shipped.is_file():
-            raise ValueError(f"family: {str(name)!r} is unknown; known are paper, general")
+            raise ValueError(f"family: {str(name)!r} is unknown; known are {', '.join(_known())}")
         name = Path(str(shipped))
     return family_from_dict(read_toml(name))
+
+
+def _known() -> list[str]:
+    shipped = (Path(str(file)) for file in resources.files("ocp.families").iterdir())
+    return sorted({PAPER_FAMILY.name, *(f.stem for f in shipped if f.suffix == ".toml")})
 
 
 def family_from_dict(table: Mapping[str, Any]) -> QueryFamily:

@@ -115,6 +115,11 @@ class Verdict:
             for name, a in self.answers.items()
             if a.value is None and a.status is not Status.NOT_APPLICABLE
         )
+        if len(self.spread) == 1:
+            (only,) = self.spread
+            return f"only {only} has an answer, which no second method confirms" + (
+                f": {failures}" if failures else ""
+            )
         return "no two methods agree on the least cost: " + "; ".join(
             filter(None, (gaps, failures))
         )

@@ -4,6 +4,7 @@ import ast
 import inspect
 import math
 import textwrap
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,7 +36,7 @@ COMPARISONS = {
 }  # fmt: skip
 
 
-class Expressions:
+class Expressions(ABC):
     """What is known while one kernel is translated, and its expressions."""
 
     def __init__(self, module: Module, dispatcher: Any, name: str) -> None:
@@ -85,17 +86,20 @@ class Expressions:
     def sizes(self, code: str, kind: Type) -> list[str]:
         return [f"{code}.size[{i}]" for i in range(kind.axes)]
 
+    @abstractmethod
     def is_fresh(self, node: ast.expr) -> bool:
         """Whether an expression makes a new array."""
-        raise NotImplementedError
+        ...
 
+    @abstractmethod
     def allocated(self, node: ast.expr) -> tuple[str, Type]:
         """A new array, as an expression."""
-        raise NotImplementedError
+        ...
 
+    @abstractmethod
     def reshaped(self, code: str, kind: Type, node: ast.Call) -> tuple[str, Type]:
         """An array seen in another shape."""
-        raise NotImplementedError
+        ...
 
     def array(self, node: ast.expr) -> tuple[str, Type]:
         """An array, or other value, by a name that may be repeated."""

@@ -13,7 +13,7 @@ from rich.table import Table
 from ocp.models.multibody import multibody_model
 from ocp.oracle import consult
 from ocp.query import Query
-from ocp.regulation import RegulationValue
+from ocp.regulation_value import RegulationValue
 from ocp.value import greedy
 from sims.closed_loop import LoopSettings, Rollout, drake_rollout
 from sims.demos import Demonstration

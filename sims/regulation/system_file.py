@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from learning.q_learning.quadratic_cost import QuadraticCost
 from ocp.query_file import read_toml
 from ocp.riccati import DifferentialRiccati, LinearQuadratic, differential_riccati
+from sims.toml_tables import number_of, numbers_of, rows_of
 
 Array = NDArray[np.float64]
 
@@ -96,19 +97,22 @@ class SystemFile:
         for key in REQUIRED:
             if key not in table:
                 raise ValueError(f"{key}: missing")
-        matrices = {k: _rows(table[k], k) for k in ("A", "B", "M", "R", "terminal")}
+        matrices = {k: rows_of(table[k], k) for k in ("A", "B", "M", "R", "terminal")}
         problem = LinearQuadratic(*(matrices[k] for k in ("A", "B", "M", "R")))
         cost = QuadraticCost(
-            matrices["M"], matrices["R"], matrices["terminal"], _number(table["horizon"], "horizon")
+            matrices["M"],
+            matrices["R"],
+            matrices["terminal"],
+            number_of(table["horizon"], "horizon"),
         )
         options: dict[str, Any] = {
-            k: _number(table[k], k)
+            k: number_of(table[k], k)
             for k in ("sample_period", "data_seconds", "probing", "noise")
             if k in table
         }
         if "behaviour_gain" in table:
-            options["behaviour_gain"] = _rows(table["behaviour_gain"], "behaviour_gain")
-        return cls(problem, cost, _numbers(table["start"], "start"), **options)
+            options["behaviour_gain"] = rows_of(table["behaviour_gain"], "behaviour_gain")
+        return cls(problem, cost, numbers_of(table["start"], "start"), **options)
 
     def exact(self) -> DifferentialRiccati:
         """The optimal regulator."""
@@ -137,24 +141,3 @@ def need_controllable(A: Array, B: Array) -> None:
             raise ValueError(
                 f"A, B: not controllable: no input reaches the mode with eigenvalue {s:.4g}"
             )
-
-
-def _number(value: Any, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"{name}: must be a number, got {value!r}")
-    return float(value)
-
-
-def _numbers(value: Any, name: str) -> Array:
-    if not isinstance(value, Sequence) or isinstance(value, str) or not value:
-        raise ValueError(f"{name}: must be a list of numbers, got {value!r}")
-    return np.array([_number(v, name) for v in value])
-
-
-def _rows(value: Any, name: str) -> Array:
-    if not isinstance(value, Sequence) or isinstance(value, str) or not value:
-        raise ValueError(f"{name}: must be a list of rows of numbers, got {value!r}")
-    rows = [_numbers(row, name) for row in value]
-    if len({len(row) for row in rows}) != 1:
-        raise ValueError(f"{name}: rows must be of equal length, got {value!r}")
-    return np.array(rows)

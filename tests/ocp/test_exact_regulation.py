@@ -11,14 +11,8 @@ from ocp.grid import Grid
 from ocp.grids.regulation_grid import solve_regulation_grid
 from ocp.oracle import consult
 from ocp.query import Equilibrium, Query
-from ocp.regulation import (
-    RegulationValue,
-    RegulatorValue,
-    expand,
-    pmp_regulation,
-    regulator,
-    solve_regulation,
-)
+from ocp.regulation import RegulatorValue, pmp_regulation, regulator, solve_regulation
+from ocp.regulation_value import RegulationValue, expand
 from ocp.trajectory import SolveError, Status, Trajectory
 from ocp.value import greedy
 from sims.closed_loop import rollout

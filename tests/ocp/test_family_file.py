@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ocp.family_file import family_from_dict, load_family, with_obstacle_count
-from ocp.query_family import PAPER_FAMILY
+from ocp.query_family import PAPER_FAMILY, paper_query
 from ocp.query_file import read_toml
 
 
@@ -38,6 +38,13 @@ def test_a_family_is_named_or_read(table):
     assert first == family_from_dict(table).sample(np.random.default_rng(3))
 
 
+def test_a_family_of_one_query():
+    """The paper's, by its own description."""
+    family = load_family("paper-1-1")
+    for seed in range(3):
+        assert family.sample(np.random.default_rng(seed)) == paper_query((1.0, 1.0))
+
+
 def test_more_obstacles_than_the_family_has(table):
     crowded = with_obstacle_count(table, 7, 10)
     rng = np.random.default_rng(0)
@@ -45,7 +52,7 @@ def test_more_obstacles_than_the_family_has(table):
 
 
 def test_an_unknown_family_is_refused():
-    with pytest.raises(ValueError, match="'mine' is unknown"):
+    with pytest.raises(ValueError, match="'mine' is unknown; known are general, paper, paper-1-1"):
         load_family("mine")
 
 

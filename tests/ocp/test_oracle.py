@@ -53,7 +53,7 @@ def test_collocation_alone_establishes_nothing() -> None:
     assert verdict.answers["PMP"].value is None
     assert verdict.answers["collocation"].value is not None
     assert not verdict.established
-    assert "no two methods agree" in verdict.explanation
+    assert "only collocation has an answer" in verdict.explanation
 
 
 def answers(**costs: float | None) -> Verdict:

@@ -28,7 +28,8 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Linearize
 
 from ocp.equilibrium import equilibrium_input, linearise
-from ocp.models.multibody import MultibodyModel, Thruster, multibody_model
+from ocp.models.multibody import MultibodyModel, multibody_model
+from ocp.models.plant_file import Thruster
 from ocp.models.recursion import by_recursion
 from ocp.models.robots import ROBOTS, robot_file
 from ocp.models.symbolic_translation import ExpressionTooLargeError, by_symbols

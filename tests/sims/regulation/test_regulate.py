@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sims.regulation.regulate import LEARNERS, regulate, run
-from sims.regulation.study import gain_errors, identification_errors, load
+from sims.regulation.study_motions import gain_errors, identification_errors, load
 from sims.regulation.system_file import shipped_systems
 
 KEYS = [

@@ -18,7 +18,9 @@ from sims.regulation.simulation import (
     sampled_motion,
     streams,
 )
-from sims.regulation.study import exact_map, held_cost, load
+from sims.regulation.study_events import held_cost
+from sims.regulation.study_motions import load
+from sims.regulation.study_times import exact_map
 from sims.regulation.system_file import shipped_systems
 
 NAMES = list(shipped_systems())

@@ -57,7 +57,7 @@ def test_defaults(tmp_path):
     ("old", "new", "message"),
     [
         ("horizon = 5", "horizon = 0", "^horizon: must be a positive"),
-        ("horizon = 5", "horizon = nan", "^horizon: must be a positive"),
+        ("horizon = 5", "horizon = nan", "^horizon: must be a number"),
         ("horizon = 5", "horizon = true", "^horizon: must be a number"),
         ("horizon = 5\n", "", "^horizon: missing"),
         ("R = [[2]]", "R = [[-2]]", "^R: must be positive definite"),
@@ -66,7 +66,7 @@ def test_defaults(tmp_path):
         ("B = [[0], [1]]", "B = [[1], [0]]", "^A, B: not controllable.*eigenvalue 0"),
         ("B = [[0], [1]]", "B = [[0], [1, 2]]", "^B: rows must be of equal length"),
         ("B = [[0], [1]]", "B = [0, 1]", "^B: must be a list of numbers"),
-        ("[0.0, 0.0]]", "[0.0, nan]]", "^A: numbers must be finite"),
+        ("[0.0, 0.0]]", "[0.0, nan]]", "^A: must be a number, got nan"),
         ("M = [[10, 0], [0, 10]]", "M = [[10, 1], [0, 10]]", "^M: must be symmetric"),
         ("terminal = [[0.5, 0], [0, 0.5]]", "terminal = [[-1, 0], [0, 1]]", "^terminal: must be"),
         ("start = [1, 0]", "start = [1]", "^start: must be 2 finite numbers"),
