@@ -26,6 +26,8 @@ from ocp.value import Policy
 
 KIND = "trpo"
 TRAINED = PRETRAINED / "trpo.safetensors"
+TRAINED_ALONE = PRETRAINED / "trpo-1-1.safetensors"
+"""A policy for one query only, as the paper trains them: the paper's with its goal at (1, 1)."""
 
 
 @dataclass(frozen=True)

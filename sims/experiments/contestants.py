@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from ocp.planning import Answer, OneShot, Planner, Until, never, trajectories
 from ocp.query import Query
+from ocp.query_family import PAPER_GOALS
 from sims.closed_loop import LoopSettings
-from sims.methods import METHODS
+from sims.methods import METHODS, trained_by_trpo
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class Contestant:
         period: seconds for which its inputs are held; by default the method's.
         slow: left out of quick runs.
         note: the reading or settings that its figures rest on.
+        only: the goals of the paper's queries that it is for; by default all.
     """
 
     key: str
@@ -39,6 +41,7 @@ class Contestant:
     period: float | None = None
     slow: bool = False
     note: str = ""
+    only: tuple[tuple[float, float], ...] = PAPER_GOALS
 
     @property
     def held(self) -> float:
@@ -90,6 +93,12 @@ def _set_valued(shape: str, feedback: str) -> Callable[[], Planner]:
         return OneShot(solve)
 
     return make
+
+
+def _trpo_alone() -> Planner:
+    from learning.trpo.policy import TRAINED_ALONE
+
+    return trained_by_trpo(TRAINED_ALONE)
 
 
 def _refmm(simplices: int) -> Callable[[], Planner]:
@@ -203,6 +212,16 @@ CONTESTANTS = (
         NEVER,
         "TRPO",
         note="one policy for the whole family, about a million steps; the paper trains one a query",
+    ),
+    Contestant(
+        "trpo-alone",
+        "TRPO, trained for (1, 1) alone",
+        "",
+        _trpo_alone,
+        NEVER,
+        period=METHODS["trpo"].period,
+        note="the settings and steps of the policy for the whole family",
+        only=((1.0, 1.0),),
     ),
     Contestant(
         "interpolation",

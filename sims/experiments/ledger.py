@@ -16,11 +16,16 @@ def ledger(out: Path) -> Sheet:
         path = out / f"{name}.json"
         if path.is_file():
             document = json.loads(path.read_text(encoding="utf-8"))
+            try:
+                entries = experiment(name).entries(document["findings"])
+            except KeyError as missing:
+                sheet.notes.append(f"{name}: by an older version, without {missing}; run it again.")
+                continue
             mode = "quick" if document["quick"] else "full"
             machine = document["machine"]
             cores = f"{machine['cores']} cores, Python {machine['python']}"
             sheet.notes.append(f"{name}: {mode} run, seed {document['seed']}, {cores}.")
-            for entry in experiment(name).entries(document["findings"]):
+            for entry in entries:
                 sheet.add(*cells(entry))
         else:
             sheet.notes.append(f"{name}: not run.")

@@ -116,6 +116,7 @@ def on_the_four_queries(
         "paper_row": contestant.row,
         "note": contestant.note,
         "absent": absent,
+        "only": [list(goal) for goal in contestant.only],
         "costs": [None] * len(GOALS),
         "seconds": [None] * len(GOALS),
         "cpu_seconds": [None] * len(GOALS),
@@ -133,6 +134,8 @@ def on_the_four_queries(
         return judged(contestant, paper_query(goal), [PAPER_START])
 
     for k, goal in enumerate(GOALS):
+        if goal not in contestant.only:
+            continue
         name = "plan-{}-{:g}-{:g}".format(contestant.key, *goal)
         answer = parts.get(name, contestant.config, lambda goal=goal: measured(goal))
         if answer["loops"] is None:

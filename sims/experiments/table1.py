@@ -37,8 +37,9 @@ def sheet(document: dict[str, Any]) -> Sheet:
     for row in document["rows"]:
         claims = TABLE_I.get(row["paper_row"] or "")
         cells = []
-        for k, cost in enumerate(row["costs"]):
+        for k, (goal, cost) in enumerate(zip(document["goals"], row["costs"], strict=True)):
             text = ABSENT if row["absent"] else number(cost, "{:.2f}", "not reached")
+            text = text if goal in row["only"] else "-"
             cells.append(text if claims is None else f"{text} [{claims[k]:.1f}]")
         result.add(row["label"], *cells, percent(excess_of(row, optima), "-"))
     result.notes = [f"{r['label']}: {r['absent'] or r['note']}." for r in document["rows"]]
@@ -106,7 +107,8 @@ def entries(document: dict[str, Any]) -> list[Entry]:
                     f"{claims[k]:.1f}",
                     ours=ABSENT if ours["absent"] else number(cost, "{:.3f}", "not reached"),
                     optimum=number(optimum, "{:.3f}"),
-                    remark=_remark(ours, claims[k], cost, optimum),
+                    remark=_remark(ours, claims[k], cost, optimum)
+                    + (_alone(document, k) if row == "TRPO" else ""),
                 )
             )
     found += _text_entries(by_row, optima)
@@ -126,6 +128,13 @@ def _remark(row: dict[str, Any], claim: float, cost: float | None, optimum: floa
     if cost < claim:
         return f"Lower than the paper's: {gap}."
     return f"Higher than the paper's: {gap} ({row['note']})."
+
+
+def _alone(document: dict[str, Any], k: int) -> str:
+    """What TRPO costs on the k-th query if it is trained for that one, as the paper does."""
+    alone = next((r for r in document["rows"] if r["key"] == "trpo-alone"), None)
+    cost = alone["costs"][k] if alone else None
+    return "" if cost is None else f" Trained for this query alone, {cost:.3f}."
 
 
 def _above(row: dict[str, Any], optima: list[float | None]) -> str:

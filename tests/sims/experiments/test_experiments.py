@@ -25,12 +25,13 @@ FEW = (
     contestant("eikonal"),
     Contestant("nobody", "MPC", "not-yet-made", lambda: OneShot(fails), NEVER, "MPC"),
     Contestant("loser", "loses", "", lambda: OneShot(fails), NEVER),
+    contestant("trpo-alone"),
 )
 
 
 @pytest.fixture(scope="module")
 def few(tmp_path_factory) -> tuple[Path, dict]:
-    """Table I with three contestants: one that works, one that does not exist, one that fails."""
+    """Table I: one that works, one that does not exist, one that fails, one for a single goal."""
     out = tmp_path_factory.mktemp("reproduced")
     with pytest.MonkeyPatch.context() as patch:
         rows = {c.row: c for c in CONTESTANTS if c.row} | {"MPC": FEW[1]}
@@ -38,7 +39,7 @@ def few(tmp_path_factory) -> tuple[Path, dict]:
             Contestant(c.key, c.label, "not-yet-made", c.planner, NEVER, c.row)
             for c in rows.values()
         ]
-        patch.setattr(table1, "CONTESTANTS", (*hidden, FEW[0], FEW[2]))
+        patch.setattr(table1, "CONTESTANTS", (*hidden, FEW[0], *FEW[2:]))
         document = reproduce.reproduce("table1", Setting(True, 0, out))
     return out, document
 
@@ -66,6 +67,17 @@ def test_what_exists_is_measured_and_what_does_not_is_absent(few) -> None:
     assert "on purpose" in rows["loser"]["failures"][0]
 
 
+def test_trained_for_one_query_trpo_is_cheaper_there_than_the_papers(few) -> None:
+    """The one query on which the policy for the whole family is dearer."""
+    row = next(r for r in few[1]["findings"]["rows"] if r["key"] == "trpo-alone")
+    k = GOALS.index((1.0, 1.0))
+    assert TABLE_ONE_OPTIMA[GOALS[k]] < row["costs"][k] < TABLE_I["TRPO"][k]
+    assert [cost is None for cost in row["costs"]] == [i != k for i in range(4)]
+    line = next(x for x in (few[0] / "table1.md").read_text().splitlines() if row["label"] in x)
+    assert line.split("|")[2 + k].strip() == f"{row['costs'][k]:.2f}"
+    assert line.count("| - ") == 4
+
+
 def test_tables_figures_and_environment_are_written(few) -> None:
     out, document = few
     assert {"machine", "code", "seed", "quick", "seconds"} <= set(document)
@@ -89,6 +101,16 @@ def test_the_ledger_has_a_line_for_every_number_of_the_table(few) -> None:
     benchmark = [r for r in sheet.rows if "benchmark itself" in r[0]]
     assert [r[2].split()[0] for r in benchmark] == ["11.1", "5.17", "3.01", "5.17"]
     assert any(note.startswith("fig3: not run") for note in sheet.notes)
+
+
+def test_the_ledger_leaves_out_what_an_older_version_wrote(few, tmp_path) -> None:
+    _, document = few
+    rows = [{k: v for k, v in r.items() if k != "costs"} for r in document["findings"]["rows"]]
+    old = {**document, "findings": {**document["findings"], "rows": rows}}
+    (tmp_path / "table1.json").write_text(json.dumps(old))
+    sheet = ledgers.ledger(tmp_path)
+    assert not sheet.rows
+    assert "table1: by an older version, without 'costs'; run it again." in sheet.notes
 
 
 def test_a_second_run_measures_nothing_again(few, monkeypatch) -> None:
