@@ -3,12 +3,13 @@
 From the offset e the linear regulator's closed loop moves on e^(At) e, which is linear in e. The
 penalty summed over obstacles and integrated along that motion,
 
-    J_s(e) = int_0^T sum_k w exp(-b (|p(t) - c_k|^2 - r_k^2) / s^2) dt,   p(t) of e^(At) e,
+    J_s(e) = int_0^T sum_k phi_k(p(t); b / s^2) dt,   p(t) of e^(At) e,
 
-is for s = 1 the first-order change of the value by the obstacles (their penalty along the motion
-that is optimal without them). Wider ones, s > 1, and the same with p(t) - c_k in the integrand say
-on which side the obstacles lie. All are sums over obstacles: any number of them, in any order. They
-are smooth, their derivatives are exact, and they hardly change near the goal, where no penalty is.
+with phi_k the running cost's penalty (`ocp.cost.circle_penalty`) at steepness b / s^2, is for s = 1
+the first-order change of the value by the obstacles (their penalty along the motion that is optimal
+without them). Wider ones, s > 1, and the same with p(t) - c_k in the integrand say on which side
+the obstacles lie. All are sums over obstacles: any number of them, in any order. They are smooth,
+their derivatives are exact, and they hardly change near the goal, where no penalty is.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ocp.cost import circle_penalty
 from ocp.query import Query
 from ocp.regulation import regulator
 
@@ -93,6 +95,6 @@ def _penalties(query: Query, places: Array, width: float) -> list[tuple[Array, A
     sharp = cost.obstacle_steepness / width**2
     for o in query.obstacles:
         gap = places - np.array(o.center) + query.goal_position
-        phi = cost.obstacle * np.exp(-sharp * ((gap**2).sum(axis=-1) - o.radius**2))
+        phi = circle_penalty((gap**2).sum(axis=-1), o.radius, cost.obstacle, sharp, np.exp)
         found.append((gap, phi, sharp))
     return found

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 notes = Console(stderr=True)
 
+MOST_NAMED = 3  # states that a column's head has room for
+MOST_MAPPED = 3  # states of a robot whose V is drawn over the plane
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -195,8 +198,12 @@ def run(command: "cli.Plan") -> int:
 def table(answer: Plan, method: str, outcomes: list[Outcome]) -> Table:
     """The outcomes as a table for the terminal."""
     result = Table(title=f"{method}: policy ready in {answer.reaction_time * 1e3:.1f} ms")
-    names = [c.name for c in answer.query.system.coordinates]
-    result.add_column(f"start ({', '.join(names)})")
+    names = ", ".join(c.name for c in answer.query.system.coordinates)
+    if answer.query.system.n <= MOST_NAMED:
+        result.add_column(f"start ({names})")
+    else:
+        result.add_column("start")
+        result.caption = f"start: {names}"
     for column in ("value", "cost", "exact cost", "excess", "clearance"):
         result.add_column(column, justify="right")
     result.add_column("reached")
@@ -222,7 +229,11 @@ def number(value: float | None, form: str = "{:.4f}") -> str:
 def write_outputs(
     folder: Path, document: dict[str, Any], answer: Plan, outcomes: list[Outcome]
 ) -> None:
-    """plan.json, trajectories.npz and, where positions are planar, plan.png into `folder`."""
+    """plan.json, trajectories.npz and pictures into `folder`.
+
+    plan.png for a robot in the plane; motions.png, states and inputs over time, on the way to an
+    equilibrium.
+    """
     write_text(folder / "plan.json", json.dumps(document, indent=1) + "\n")
     arrays: dict[str, NDArray] = {}
     for k, outcome in enumerate(outcomes):
@@ -237,18 +248,31 @@ def write_outputs(
                 arrays[f"{label}_{k}_cost_so_far"] = motion.cost_so_far
     with atomic_path(folder / "trajectories.npz") as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
-    if len(answer.query.system.position) == 2:
+    query, loops, optima = answer.query, [o.rollout for o in outcomes], [o.exact for o in outcomes]
+    if query.is_regulation:
+        from sims.pictures.motion_figure import motion_figure
+        from sims.pictures.plan_figure import save
+
+        save(motion_figure(query, loops, optima), folder / "motions.png")
+    if moves_in_the_plane(query):
         import matplotlib.pyplot as plt
 
         from sims.pictures.plan_figure import draw_plan, legend, save
 
         figure, axes = plt.subplots(figsize=(6.4, 6.0), layout="constrained")
-        draw_plan(
-            axes,
-            answer.query,
-            [o.rollout for o in outcomes],
-            [o.exact for o in outcomes],
-            None if isinstance(answer.value, ExactValue) else answer.value,  # too slow to map
-        )
+        draw_plan(axes, query, loops, optima, answer.value if mappable(answer) else None)
         legend(figure)
         save(figure, folder / "plan.png")
+
+
+def moves_in_the_plane(query: Query) -> bool:
+    """Whether the robot's position is a point of a plane, in metres."""
+    system = query.system
+    return len(system.position) == 2 and all(
+        system.coordinates[i].unit == "m" for i in system.position
+    )
+
+
+def mappable(answer: Plan) -> bool:
+    """Whether V at all states of a grid is a matter of moments, not of an optimisation for each."""
+    return answer.query.system.n <= MOST_MAPPED and not isinstance(answer.value, ExactValue)

@@ -76,8 +76,12 @@ def draw_plan(
         axes.plot(p[:, 0], p[:, 1], color=CLOSED_LOOP, linestyle=line, lw=1.4, zorder=5)
         _headings(axes, query, rollout.trajectory)
         axes.plot(*p[0], marker="o", color="white", mec="black", ms=5, zorder=7)
-    axes.set_xlim(x.lower, x.upper)
-    axes.set_ylim(y.lower, y.upper)
+    if query.is_regulation:  # its domain is that of starts, mostly far from what happens
+        axes.margins(0.15)
+        axes.autoscale_view()
+    else:
+        axes.set_xlim(x.lower, x.upper)
+        axes.set_ylim(y.lower, y.upper)
     axes.set_aspect("equal")
     axes.set_xlabel(f"{x.name} ({x.unit})")
     axes.set_ylabel(f"{y.name} ({y.unit})")
