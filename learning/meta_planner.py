@@ -27,7 +27,7 @@ from ocp.grid import Grid
 from ocp.planning import Plan, Until, plan
 from ocp.query import Query
 from ocp.query_family import sample_start
-from ocp.threads import usable_cores
+from ocp.threads import usable_cores, warm_workers
 from ocp.trajectory import SolveError, Status, Trajectory
 from ocp.value import Policy, Value
 
@@ -35,6 +35,7 @@ Floats = NDArray[np.float64]
 
 STRIDE = 0.15  # metres or radians: a step of the network's own closed loop
 MOST_STEPS = 400
+MANY = 4  # starts whose loops are worth another core
 MARGIN = 0.5  # metres of the grids beyond the domain
 TRAJECTORIES = 8  # exact ones, from states of its own choice if no starts are asked for
 GRIDS = (4_500, 18_000, 60_000, 240_000)
@@ -107,8 +108,8 @@ class MetaState:
         network: its network's value.
         starts: `[k, n]`, those asked for, then those of the planner's own choice.
         asked: how many were asked for.
-        loops: the network's closed loop from each start; `None` if it does not get to the goal, or
-            a grid knows a better class of motions.
+        loops: the network's closed loop from each start; `None` if it does not get to the goal.
+        suspects: starts from which a grid seems to know a better class of motions.
         extremals: the best exact trajectory from each start, or `None`.
         base: policy and value off the tubes.
         nodes: of the grid behind `base`; 0 if it is the network's.
@@ -130,6 +131,7 @@ class MetaState:
     worth_nodes: int
     ahead: Ahead[Extremal]
     extremals: tuple[Extremal | None, ...] = ()
+    suspects: frozenset[int] = frozenset()
     nodes: int = 0
     grid_policy: Policy | None = None
     trajectories: int = 0
@@ -153,6 +155,8 @@ class MetaPlanner:
     Attributes:
         networks: the first that knows a query is used for it.
         grids: whether to use grids at all; without, only network and exact trajectories.
+        patient: whether finer grids follow the exact trajectories from the few starts asked for:
+            for plans with a deadline, which use the time they have.
         cores: that it may occupy. The answer does not depend on how many, only its time does.
         clock: the times that steps take.
 
@@ -167,22 +171,23 @@ class MetaPlanner:
 
     networks: tuple[Pretrained, ...]
     grids: bool = True
+    patient: bool = False
     cores: int = field(default_factory=usable_cores)
     clock: Clock = field(default_factory=Clock)
 
     @classmethod
-    def pretrained(cls, name: str, grids: bool = True) -> "MetaPlanner":
+    def pretrained(cls, name: str, grids: bool = True, patient: bool = False) -> "MetaPlanner":
         """The planner on shipped weights, `paper` or `general`.
 
         Raises:
             ValueError: if there are no such weights, or they are damaged.
         """
-        return cls((load_pretrained(name),), grids)
+        return cls((load_pretrained(name),), grids, patient)
 
     @classmethod
-    def shipped(cls, grids: bool = True) -> "MetaPlanner":
+    def shipped(cls, grids: bool = True, patient: bool = False) -> "MetaPlanner":
         """The planner on all shipped weights, each used for the queries that it knows best."""
-        return cls((load_pretrained("paper"), load_pretrained("general")), grids)
+        return cls((load_pretrained("paper"), load_pretrained("general")), grids, patient)
 
     def plan(
         self, query: Query, starts: Sequence[ArrayLike] = (), until: Until | None = None
@@ -207,7 +212,7 @@ class MetaPlanner:
             raise SolveError(Status.NOT_APPLICABLE, "the network was trained on other queries")
         network = NetworkValue(encoder, chosen.weights)
         rows = np.array(starts, dtype=float).reshape(-1, query.system.n)
-        loops = _loops(network, rows)
+        loops = _loops(network, rows, self.cores)
         state = MetaState(
             query,
             network,
@@ -235,10 +240,12 @@ class MetaPlanner:
         large = [Step(nodes=n) for n in useful if n > 18_000]
         if asked == 0:
             return (*small, *more, *large)
-        if asked <= EARLY:
-            return (*exact, *small)
-        # Exact trajectories leave a finer grid little to gain at the few starts asked for.
-        return (*small, *exact, *(large if asked > TRAJECTORIES else ()))
+        if self.patient:
+            # No policy is read from a grid that the network is worth, but a class of motions is.
+            large = [Step(nodes=n) for n in allowed if Step(nodes=n) not in small]
+        elif asked <= TRAJECTORIES:
+            large = []  # exact trajectories leave a finer grid little to gain
+        return (*exact, *small, *large) if asked <= EARLY else (*small, *exact, *large)
 
     def refine(self, state: MetaState) -> MetaState:
         """One exact trajectory or one grid more."""
@@ -258,7 +265,7 @@ class MetaPlanner:
         if self.cores < 2:
             return state
         exact = (s.start for s in (step, *state.pending) if not s.nodes)
-        known = (i for i in exact if i < state.asked and state.loops[i] is not None)
+        known = (i for i in exact if i < state.asked and _beside_is_to_come(state, i))
         return replace(state, ahead=state.ahead.begun(known, self.cores + 1))
 
     def policy(self, state: MetaState) -> Policy:
@@ -274,30 +281,31 @@ class MetaPlanner:
         return replace(state, next_seconds=expected)
 
     def _grid(self, state: MetaState, nodes: int) -> MetaState:
-        """Solve a grid; starts whose exact trajectory it beats are to be solved again."""
+        """Solve a grid; starts that it knows cheaper motions from are the next to be solved."""
         query = state.query
         solution = solve_eikonal(query, Grid.for_query(query, nodes, MARGIN))
         policy, value = solution.policy(), solution.value
-        expected = np.asarray(value.value(state.starts)) * SUSPICION
+        known = np.array(
+            [
+                extremal.cost if extremal is not None else loop.cost if loop else np.inf
+                for loop, extremal in zip(state.loops, state.extremals, strict=True)
+            ]
+        )
+        dearer = known / np.maximum(np.asarray(value.value(state.starts)), 1e-9)
+        dearest = (int(i) for i in np.argsort(-dearer, kind="stable"))
+        suspects = [i for i in dearest if dearer[i] > SUSPICION]
         failed = any(loop is None for loop in state.loops)
-        loops, again = list(state.loops), []
-        todo = {step.start for step in state.pending}
-        for i, (loop, extremal) in enumerate(zip(state.loops, state.extremals, strict=True)):
-            known = extremal.cost if extremal is not None else loop.cost if loop else np.inf
-            if known > expected[i]:
-                loops[i] = None
-                if i not in todo:
-                    again.append(Step(start=i))
         better = failed or nodes > state.worth_nodes
-        ahead = state.ahead.without(i for i, loop in enumerate(loops) if loop is None)
         return replace(
             state,
-            loops=tuple(loops),
-            ahead=ahead,
+            suspects=frozenset(suspects),
             base=(policy, value) if better else state.base,
             nodes=nodes if better else state.nodes,
             grid_policy=policy,
-            pending=(*again, *state.pending),
+            pending=(
+                *(Step(start=i) for i in suspects),
+                *(step for step in state.pending if step.start not in suspects),
+            ),
         )
 
     def _exact(self, state: MetaState, i: int) -> MetaState:
@@ -308,32 +316,42 @@ class MetaPlanner:
             state = replace(
                 state,
                 starts=np.vstack([state.starts, own]),
-                loops=(*state.loops, *_loops(state.network, own[None])),
+                loops=(*state.loops, *_loops(state.network, own[None], self.cores)),
                 extremals=(*state.extremals, None),
             )
         if query.goal_distance(state.starts[i]) <= 0:
             return state
-        if state.loops[i] is not None and i < state.asked:
-            found, ahead = state.ahead.taken(i)
-            state = replace(state, ahead=ahead)
-        elif state.loops[i] is not None:
-            found = _beside(query, state.starts, state.loops, i)
-        elif state.grid_policy is not None:
+        found: list[Extremal] = []
+        # The grid's guess first: the search beside the network's loop is under way elsewhere.
+        if state.grid_policy is not None and (i in state.suspects or state.loops[i] is None):
             guess = rollouts(query, state.grid_policy, state.starts[i])[0]
-            if guess is None:
-                return state
-            found = find_extremal(query, state.starts[i], guess)
-        else:
+            if guess is not None:
+                found.append(find_extremal(query, state.starts[i], guess))
+        if _beside_is_to_come(state, i):
+            if i < state.asked:
+                beside, ahead = state.ahead.taken(i)
+                state = replace(state, ahead=ahead)
+            else:
+                beside = _beside(query, state.starts, state.loops, i)
+            found.append(beside)
+        if not found:
             return state
         known = state.extremals[i]
-        best = known if known is not None and known.cost <= found.cost else found
+        candidates = found if known is None else [*found, known]
+        best = min(candidates, key=lambda extremal: extremal.cost)
         extremals = list(state.extremals)
         extremals[i] = best if best.trajectory is not None else None
         return replace(
             state,
             extremals=tuple(extremals),
-            trajectories=state.trajectories + (found.trajectory is not None),
+            suspects=state.suspects - {i},
+            trajectories=state.trajectories + any(e.trajectory is not None for e in found),
         )
+
+
+def _beside_is_to_come(state: MetaState, i: int) -> bool:
+    """Whether the exact trajectory beside the network's loop from the i-th start is unknown."""
+    return state.loops[i] is not None and state.extremals[i] is None
 
 
 def _beside(query: Query, starts: Floats, loops: tuple[Loop | None, ...], i: int) -> Extremal:
@@ -343,12 +361,26 @@ def _beside(query: Query, starts: Floats, loops: tuple[Loop | None, ...], i: int
     return find_extremal(query, starts[i], loop.motion(query))
 
 
-def _loops(network: NetworkValue, starts: Floats) -> tuple[Loop | None, ...]:
-    """The closed loops of a network's policy; `None` where one does not get to the goal."""
+def _loops(network: NetworkValue, starts: Floats, cores: int) -> tuple[Loop | None, ...]:
+    """The closed loops of a network's policy; `None` where one does not get to the goal.
+
+    Half of many starts are driven on another core. The halves are the same on a single one: in
+    single precision a state's V depends, in its last digits, on those evaluated together with it.
+    """
+
+    def drive(rows: Floats) -> list[Loop | None]:
+        path, steps = network.drive(rows, STRIDE, MOST_STEPS)
+        return [
+            Loop(path[: count + 1, i].copy(), float(path[count, i, -1])) if count > 0 else None
+            for i, count in enumerate(steps)
+        ]
+
     if not len(starts):
         return ()
-    path, steps = network.drive(starts, STRIDE, MOST_STEPS)
-    return tuple(
-        Loop(path[: count + 1, i].copy(), float(path[count, i, -1])) if count > 0 else None
-        for i, count in enumerate(steps)
-    )
+    if len(starts) < MANY:
+        return tuple(drive(starts))
+    half = len(starts) // 2
+    if cores < 2:
+        return (*drive(starts[:half]), *drive(starts[half:]))
+    other = warm_workers().submit(drive, starts[half:])
+    return (*drive(starts[:half]), *other.result())

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +76,7 @@ def _eikonal(seconds: float | None = None) -> Planner:
 
 def _exact() -> OneShot:
     from ocp.pontryagin import ExactValue
-    from ocp.regulation import RegulationValue
+    from ocp.regulation_value import RegulationValue
 
     def solve(query: Query, starts: Sequence[NDArray[np.float64]]) -> Answer:
         value = RegulationValue(query) if query.is_regulation else ExactValue(query)
@@ -96,10 +97,10 @@ def _set_valued() -> OneShot:
     return OneShot(solve)
 
 
-def _adapt() -> Planner:
+def _adapt(seconds: float | None = None) -> Planner:
     from learning.meta_planner import MetaPlanner
 
-    return MetaPlanner.shipped()
+    return MetaPlanner.shipped(patient=seconds is not None)
 
 
 def _mpc() -> OneShot:
@@ -159,9 +160,20 @@ def _refmm() -> Planner:
 
 
 def _trpo() -> OneShot:
+    from learning.trpo.policy import TRAINED
+
+    return trained_by_trpo(TRAINED)
+
+
+def trained_by_trpo(path: Path) -> OneShot:
+    """The planner on the weights in a file, for the queries that they were trained on.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+    """
     from learning.trpo.policy import RolloutValue, TrpoPolicy, TrpoWeights
 
-    weights = TrpoWeights.load()
+    weights = TrpoWeights.load(path)
 
     def solve(query: Query, _starts: Sequence[NDArray[np.float64]]) -> Answer:
         try:
@@ -174,7 +186,9 @@ def _trpo() -> OneShot:
 
 
 METHODS: dict[str, Method] = {
-    "adapt": Method("a network that knows the query, exact trajectories, then grids", _adapt),
+    "adapt": Method(
+        "a network that knows the query, exact trajectories, then grids", _adapt, within=_adapt
+    ),
     "exact": Method("Pontryagin shooting from every state the robot meets", _exact),
     "eikonal": Method(
         "fast marching on a grid, interpolated one-step lookahead", _eikonal, within=_eikonal

@@ -80,11 +80,14 @@ class NetworkValue:
         return functions, *numbers, self.weights.packed, self.weights.sizes
 
     def drive(self, starts: Floats, stride: float, most: int) -> tuple[Floats, NDArray[np.int64]]:
-        """Closed loops of the greedy policy from states `[k, 3]`, in steps of constant length.
+        """Closed loops of the greedy policy from states `[k, 3]`, in steps of length `stride`.
+
+        The first `stride` goes in `FINE` steps: a random start may lie in a trap (see `_drive`).
 
         Returns:
             `[most, k, 7]`, each step's state, input, duration and the cost before it; and `[k]`,
-            the number of steps after which the goal was reached, or -1.
+            the number of steps after which the goal was reached, or -1 if it was not, or the
+            robot shuttled.
         """
         path = np.empty((most, len(starts), 7))
         steps = _drive(*self.arguments, np.ascontiguousarray(starts, dtype=float), stride, path)
@@ -132,6 +135,7 @@ def _signature(*more):
 
 
 ONE, HALF, TWO, EIGHTH = np.float32(1), np.float32(0.5), np.float32(2), np.float32(0.125)
+FINE = 6  # short steps of a loop, before those of its full stride
 SATURATED = np.float32(17)  # beyond, the sigmoid is 0 or 1 in single precision
 P0, P1, P2 = np.float32(135135), np.float32(17325), np.float32(378)
 Q0, Q1, Q2, Q3 = np.float32(135135), np.float32(62370), np.float32(3150), np.float32(28)
@@ -328,7 +332,11 @@ def _control(functions, table, numbers, q, bare, obstacles, weights, sizes, stat
 
 @compiled(types.Array(int64, 1, "C")(*KNOWLEDGE, MATRIX, float64, types.Array(float64, 3, "C")))
 def _drive(functions, table, numbers, q, bare, obstacles, weights, sizes, starts, stride, path):
-    """Closed loops in midpoint steps of constant length, until the goal.
+    """Closed loops in midpoint steps, until the goal; the first `FINE` of them short.
+
+    A random start may lie beside a kink of the learned V, where a robot can shuttle for ever; a
+    long step would pass over it. Farther on the motion itself leads away from kinks. A loop whose
+    input is reversed twice in succession is given up.
 
     Fills path `[s, k, n + m + 2]` with states, inputs, durations of steps and costs before them;
     returns the number of steps after which each was in the goal, or -1.
@@ -342,8 +350,10 @@ def _drive(functions, table, numbers, q, bare, obstacles, weights, sizes, starts
     rate, half = np.empty(n), np.empty(n)
     x = starts.copy()
     spent = np.zeros(count)
+    reversals = np.zeros(count, dtype=np.int64)
     left = count
     for s in range(most):
+        length = stride / FINE if s < FINE else stride
         remaining = 0
         for a in range(left):
             i = active[a]
@@ -352,7 +362,7 @@ def _drive(functions, table, numbers, q, bare, obstacles, weights, sizes, starts
             gap = (x[i, 0] - numbers[0]) ** 2 + (x[i, 1] - numbers[1]) ** 2
             if gap <= numbers[2] ** 2:
                 steps[i] = s
-            else:
+            elif reversals[i] < 2:
                 active[remaining] = i
                 remaining += 1
         left = remaining
@@ -365,15 +375,17 @@ def _drive(functions, table, numbers, q, bare, obstacles, weights, sizes, starts
         _control(functions, table, numbers, q, bare, obstacles, weights, sizes, now, inputs)
         for a in range(left):
             i = active[a]
-            effort = 0.0
+            effort, along = 0.0, 0.0
             for j in range(m):
                 effort += q[j] * inputs[a, j] ** 2
-            h = stride / max(np.sqrt(effort), 1e-12)
+                along += q[j] * inputs[a, j] * path[s - 1, i, n + j] if s > 0 else 0.0
+            reversals[i] = reversals[i] + 1 if along < 0.0 else 0
+            h = length / max(np.sqrt(effort), 1e-12)
             dynamics(x[i], inputs[a], rate)
             for j in range(n):
                 half[j] = x[i, j] + 0.5 * h * rate[j]
             dynamics(half, inputs[a], rate)
-            spent[i] += 2.0 * np.sqrt(state_cost(half, q)) * stride  # at the best speed
+            spent[i] += 2.0 * np.sqrt(state_cost(half, q)) * length  # at the best speed
             for j in range(n):
                 x[i, j] += h * rate[j]
             path[s, i, n : n + m] = inputs[a]

@@ -34,6 +34,7 @@ BENCHMARKS: dict[str, str] = {
     "rrtx": "RRT^X: repair after changes, against growth from scratch, OMPL and the optimum",
     "startup": "processor time and memory of zermelo --help and of each package's import",
     "store": "value store: time and bytes an entry, kills survived",
+    "training": "training on two processes against one: time of a step",
     "learning": "adapt on fresh queries of three families against exact costs",
     "learning-curve": "excess and success against time, every method on the same problems",
 }

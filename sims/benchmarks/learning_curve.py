@@ -100,7 +100,7 @@ def run(seed: int, out: Path | None, queries: int = QUERIES, starts: int = START
 
 def _points(name: str) -> list[Point]:
     planners = {
-        "adapt": MetaPlanner.pretrained(name),
+        "adapt": MetaPlanner.pretrained(name, patient=True),
         "adapt without grids": MetaPlanner.pretrained(name, grids=False),
     }
     points = [

@@ -62,6 +62,24 @@ def test_the_network_alone_drives_the_last_centimetres(name):
         assert all(loop.reached for loop in loops), query
 
 
+@pytest.mark.parametrize("name", FAMILIES)
+def test_the_check_of_the_networks_loops_tells_who_arrives(name):
+    """Among the starts is one 6 cm from a kink, where the robot of the paper's network shuttles."""
+    rng = np.random.default_rng(2_000_002)
+    family, planner = load_family(name), MetaPlanner.pretrained(name, grids=False)
+    asked = [family.sample_with_start(rng) for _ in range(20)]
+    asked.append(
+        (
+            paper_query((0.470575030919807, 3.4017452118524854)),
+            np.array([2.02507507, -2.88613523, -2.90194529]),
+        )
+    )
+    for query, start in asked:
+        state = planner.start(query, [start])
+        (driven,) = rollouts(planner.policy(state), [start], LOOP)
+        assert driven.reached == (state.loops[0] is not None), (query, start)
+
+
 def test_exact_trajectories_from_the_starts_asked_for_close_the_gap(problem):
     name, query, starts, optima = problem
     planned = MetaPlanner.pretrained(name).plan(query, starts, trajectories(8))
@@ -83,6 +101,41 @@ def test_refinement_never_makes_the_answer_worse_and_keeps_its_argument(problem)
     assert planner.policy(planner.start(query, starts)) is not before
     assert pending == planner.start(query, starts).pending
     assert aggregate_excess(planner.policy(state), starts, optima) < worst + 1e-4
+
+
+def test_starts_that_a_grid_knows_better_motions_from_come_first(problem):
+    """And the network's own loop stays a guess beside the grid's: the grid may be wrong."""
+    name, query, starts, optima = problem
+    planner = MetaPlanner.pretrained(name)
+    state = planner.start(query, starts)
+    dear = {1: 1.3, 3: 1.5}
+    loops = tuple(
+        replace(loop, cost=dear.get(i, 0.9) * optimum)
+        for i, (loop, optimum) in enumerate(zip(state.loops, optima, strict=True))
+        if loop is not None
+    )
+    grid, *rest = sorted(state.pending, key=lambda step: step.nodes == 0)
+    state = planner.refine(replace(state, loops=loops, pending=(grid, *rest)))
+    assert state.suspects == set(dear)
+    assert [step.start for step in state.pending[:2]] == [3, 1]
+    assert state.loops == loops
+    state = planner.refine(state)
+    assert state.suspects == {1}
+    extremal = state.extremals[3]
+    assert extremal is not None
+    assert extremal.cost == pytest.approx(optima[3], rel=1e-4)
+
+
+def test_only_the_patient_go_on_to_fine_grids_after_few_trajectories(problem):
+    name, query, starts, _ = problem
+    finest = {}
+    for patient in (False, True):
+        planner = MetaPlanner.pretrained(name, patient=patient)
+        pending = planner.start(query, starts).pending
+        assert {step.start for step in pending if not step.nodes} == set(range(4))
+        finest[patient] = max(step.nodes for step in pending)
+    assert finest[False] <= 18_000
+    assert finest[True] == pending[-1].nodes == 240_000
 
 
 def test_no_starts_mean_the_whole_space(problem):

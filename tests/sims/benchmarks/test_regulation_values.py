@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from learning.causality_free.families import get_family
+from ocp.oracle import consult
 from ocp.query import Query
+from ocp.regulation import RegulatorValue
 from sims.benchmarks import regulation_values as bench
 
 SMALL_SLICE = bench.Slice("pendulum", (0, 1), (0.3, 0.6), 5, (), ((41, 61), (81, 121)))
@@ -32,13 +35,24 @@ def test_the_grid_lies_above_by_an_error_that_falls_with_the_cell(values) -> Non
     assert np.nanmedian(fine) < 0.7 * np.nanmedian(coarse)
 
 
-def test_the_network_is_nearer_than_the_regulator_in_its_box(values) -> None:
+@pytest.mark.slow
+def test_a_network_is_right_in_the_box_where_the_regulator_is_not() -> None:
+    """The cart-pole's: in the pendulum's box x'Px is off by 0.8 %, less than so brief a network.
+
+    With three seeds the mean error over 24 such states was 1.2, 1.4 and 1.8 %, x'Px's 8.7 %.
+    """
+    query = Query.load(bench.Path(bench.__file__).parent.parent / "queries" / "cart-pole.toml")
+    reach = np.array(get_family("cart-pole").reach)
+    states = query.reference + np.random.default_rng(5).uniform(-1, 1, (8, 4)) * reach
+    verdicts = [consult(query, state) for state in states]
+    assert all(verdict.established for verdict in verdicts)
+    exact = np.array([verdict.value for verdict in verdicts])
+    learned = bench.network(query, "cart-pole", 0, BRIEF)
     own, linear = (
-        np.nanmean(np.abs(values.error(name)[values.inside]))
-        for name in ("network", "linear regulator")
+        np.abs(v.value(states) / exact - 1).mean() for v in (learned, RegulatorValue(query))
     )
-    assert own < linear  # after a few seconds of training; the benchmark trains four times as long
-    assert own < 0.02
+    assert 1e-4 < own < 0.035
+    assert own < linear / 2
 
 
 def test_slices_pass_beside_the_goal() -> None:
