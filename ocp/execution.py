@@ -80,6 +80,10 @@ class Door(Executor):
         """Whether `error` says that the task's worker or the connection died."""
         return isinstance(error, BrokenExecutor)
 
+    def gave_up(self, error: BaseException) -> bool:
+        """Whether workers died under the task so often that it was given up, guilty or not."""
+        return False
+
 
 class InProcess(Door):
     """Work done here and now, in the calling thread."""
@@ -206,6 +210,12 @@ class Cluster(Door):
     def lost(self, error: BaseException) -> bool:
         return isinstance(error, (BrokenExecutor, CancelledError, OSError, TimeoutError))
 
+    def gave_up(self, error: BaseException) -> bool:
+        """The scheduler counts a worker's death against every task that it held."""
+        from distributed.scheduler import KilledWorker
+
+        return isinstance(error, KilledWorker)
+
     def reopen(self) -> None:
         self._close()
         self._open()
@@ -290,7 +300,8 @@ def completed(
 
     Tasks are drawn as they are needed, so they may be many. A task whose worker died is tried
     again. When several were running, each is tried alone, so that the blame is certain and no
-    other is lost with it; one that kills its worker `DEATHS` times alone fails as "WorkerDied".
+    other is lost with it; one that kills its worker `DEATHS` times alone fails as "WorkerDied",
+    on a cluster as "KilledWorker" once the scheduler gives it up alone.
     Leaving the loop early cancels what has not begun.
 
     Args:
@@ -307,13 +318,19 @@ def completed(
     suspects: deque[tuple[int, Any]] = deque()
     running: dict[Future, tuple[int, Any]] = {}
     deaths: dict[int, int] = {}
+    tried_alone: set[int] = set()
     reopened = 0
     try:
         while True:
             room = 1 if suspects else ahead * door.capacity
             broken = False
             while len(running) < room:
-                item = suspects.popleft() if suspects else next(numbered, None)
+                if suspects:
+                    item = suspects.popleft()
+                    if not running:
+                        tried_alone.add(item[0])
+                else:
+                    item = next(numbered, None)
                 if item is None:
                     break
                 try:
@@ -339,6 +356,8 @@ def completed(
                     yield Outcome(*item, answer, failure)
                 elif door.lost(error):
                     died.append(item)
+                elif door.gave_up(error) and item[0] not in tried_alone:
+                    suspects.append(item)
                 else:
                     yield Outcome(*item, None, Failure(type(error).__name__, str(error)))
             if not (died or broken):
