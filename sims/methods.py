@@ -100,7 +100,7 @@ def _set_valued() -> OneShot:
 def _adapt(seconds: float | None = None) -> Planner:
     from learning.meta_planner import MetaPlanner
 
-    return MetaPlanner.shipped(patient=seconds is not None)
+    return MetaPlanner.shipped(seconds=seconds)
 
 
 def _mpc() -> OneShot:

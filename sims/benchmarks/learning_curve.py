@@ -5,7 +5,7 @@ the paper's family its competitors: model predictive control, interpolation by a
 value learning as printed and repaired. Costly ones get fewer of the queries, the first ones.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -100,11 +100,11 @@ def run(seed: int, out: Path | None, queries: int = QUERIES, starts: int = START
 
 def _points(name: str) -> list[Point]:
     planners = {
-        "adapt": MetaPlanner.pretrained(name, patient=True),
+        "adapt": MetaPlanner.pretrained(name),
         "adapt without grids": MetaPlanner.pretrained(name, grids=False),
     }
     points = [
-        Point(label, budget, partial(planned, planner, deadline(budget)))
+        Point(label, budget, partial(planned, replace(planner, seconds=budget), deadline(budget)))
         for label, planner in planners.items()
         for budget in BUDGETS
     ]

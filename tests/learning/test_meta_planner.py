@@ -6,10 +6,20 @@ import numpy as np
 import pytest
 
 from learning import MetaPlanner
+from learning.adaptation import schedule
+from learning.adaptation.schedule import Clock, Step
 from learning.conditioned.pretrained_weights import MOST_BYTES, load_pretrained
-from learning.meta_planner import Clock, Step
 from learning.shipped import PRETRAINED
-from ocp import Goal, Obstacle, Query, SolveError, exact_trajectory, iterations, trajectories
+from ocp import (
+    Goal,
+    Obstacle,
+    Query,
+    SolveError,
+    deadline,
+    exact_trajectory,
+    iterations,
+    trajectories,
+)
 from ocp.family_file import load_family
 from ocp.query_family import PAPER_FAMILY, PAPER_START, paper_query, sample_start
 from sims.closed_loop import LoopSettings, rollouts
@@ -103,10 +113,11 @@ def test_refinement_never_makes_the_answer_worse_and_keeps_its_argument(problem)
     assert aggregate_excess(planner.policy(state), starts, optima) < worst + 1e-4
 
 
-def test_starts_that_a_grid_knows_better_motions_from_come_first(problem):
+@pytest.mark.parametrize("cores", [1, 2])
+def test_starts_that_a_grid_knows_better_motions_from_come_first(problem, cores):
     """And the network's own loop stays a guess beside the grid's: the grid may be wrong."""
     name, query, starts, optima = problem
-    planner = MetaPlanner.pretrained(name)
+    planner = replace(MetaPlanner.pretrained(name), cores=cores)
     state = planner.start(query, starts)
     dear = {1: 1.3, 3: 1.5}
     loops = tuple(
@@ -126,16 +137,58 @@ def test_starts_that_a_grid_knows_better_motions_from_come_first(problem):
     assert extremal.cost == pytest.approx(optima[3], rel=1e-4)
 
 
-def test_only_the_patient_go_on_to_fine_grids_after_few_trajectories(problem):
+def test_a_grid_becomes_the_base_only_if_its_own_loops_are_better(problem):
     name, query, starts, _ = problem
-    finest = {}
-    for patient in (False, True):
-        planner = MetaPlanner.pretrained(name, patient=patient)
-        pending = planner.start(query, starts).pending
-        assert {step.start for step in pending if not step.nodes} == set(range(4))
-        finest[patient] = max(step.nodes for step in pending)
-    assert finest[False] <= 18_000
-    assert finest[True] == pending[-1].nodes == 240_000
+    planner = MetaPlanner.pretrained(name)
+    state = planner.start(query, starts)
+    grid, *rest = sorted(state.pending, key=lambda step: step.nodes == 0)
+    for factor, better in ((0.5, False), (2.0, True)):
+        posed = replace(state, base_costs=factor * state.base_costs, pending=(grid, *rest))
+        refined = planner.refine(posed)
+        assert (refined.base is not posed.base) == better
+        assert (refined.nodes > 0) == better
+        changed = refined.base_costs != posed.base_costs
+        assert changed.all() == better
+
+
+def test_a_start_in_the_goal_needs_nothing(problem):
+    name, query, starts, _ = problem
+    inside = query.reference + 0.1 * query.goal.radius * np.eye(query.system.n)[0]
+    planner = MetaPlanner.pretrained(name)
+    state = planner.start(query, [inside, starts[0]])
+    assert state.nodes == 0, "no grid stands in for a loop that is not needed"
+    while not state.finished:
+        state = planner.refine(state)
+    assert state.trajectories == 1
+    assert state.extremals[0] is None
+    assert float(planner.value(state).value(inside)) == 0.0
+
+
+def test_only_a_deadline_lets_fine_grids_follow_few_trajectories():
+    assert schedule.steps(4, grids=True, patient=False)[-1] == Step(nodes=18_000)
+    assert schedule.steps(4, grids=True, patient=True)[-1] == Step(nodes=240_000)
+    for asked in (0, 1, 4, 5, 20):
+        for patient in (False, True):
+            steps = schedule.steps(asked, grids=True, patient=patient)
+            exact = [s.start for s in steps if not s.nodes]
+            assert exact == list(range(asked or schedule.TRAJECTORIES))
+            assert (steps[0] == Step(nodes=18_000)) == (asked not in (1, 4))
+            alone = schedule.steps(asked, grids=False, patient=patient)
+            assert [s.start for s in alone] == exact
+
+
+@pytest.mark.parametrize("seconds", [0.02, 0.5])
+def test_with_a_deadline_what_is_ready_first_is_used_first(problem, seconds):
+    """Whatever the order, all that was begun in time is an exact motion or a grid's base."""
+    name, query, starts, optima = problem
+    planner = MetaPlanner.pretrained(name, seconds=seconds)
+    for _ in range(3):  # the first also loads code
+        planned = planner.plan(query, starts, deadline(seconds))
+    assert planned.trajectories <= 4 + 4 * len(schedule.GRIDS)
+    assert -1e-4 < aggregate_excess(planned.policy, starts, optima) < 0.05
+    if seconds > 0.1:
+        assert planned.trajectories >= 4
+        assert aggregate_excess(planned.policy, starts, optima) < 1e-3
 
 
 def test_no_starts_mean_the_whole_space(problem):

@@ -1,8 +1,9 @@
 """Work begun on other cores before its turn comes, and taken when it does."""
 
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 from ocp.threads import warm_workers
@@ -17,10 +18,12 @@ class Ahead(Generic[Answer]):
     Attributes:
         work: computes the answer of a task.
         under_way: futures by the tasks' numbers.
+        since: when each of them was handed over, seconds of `time.perf_counter`.
     """
 
     work: Callable[[int], Answer]
     under_way: dict[int, Future[Answer]] = field(default_factory=dict)
+    since: dict[int, float] = field(default_factory=dict)
 
     def ready(self, task: int) -> bool:
         """Whether the task's answer is there already."""
@@ -28,20 +31,22 @@ class Ahead(Generic[Answer]):
 
     def begun(self, tasks: Iterable[int], most: int) -> "Ahead[Answer]":
         """With further tasks, in their order, handed to other cores while at most `most` wait."""
-        under_way = dict(self.under_way)
+        under_way, since = dict(self.under_way), dict(self.since)
         for task in tasks:
             if len(under_way) >= most:
                 break
             if task not in under_way:
                 under_way[task] = warm_workers().submit(self.work, task)
-        return Ahead(self.work, under_way)
+                since[task] = time.perf_counter()
+        return replace(self, under_way=under_way, since=since)
 
     def without(self, tasks: Iterable[int]) -> "Ahead[Answer]":
         """Without tasks that are no longer wanted."""
         dropped = set(tasks)
         for task in dropped & self.under_way.keys():
             self.under_way[task].cancel()
-        return Ahead(self.work, {i: f for i, f in self.under_way.items() if i not in dropped})
+        left = {i: f for i, f in self.under_way.items() if i not in dropped}
+        return replace(self, under_way=left)
 
     def taken(self, task: int) -> "tuple[Answer, Ahead[Answer]]":
         """A task's answer, and the others.
@@ -52,9 +57,9 @@ class Ahead(Generic[Answer]):
         rest = dict(self.under_way)
         mine = rest.pop(task, None)
         if mine is None or mine.cancel():
-            return self.work(task), Ahead(self.work, rest)
+            return self.work(task), replace(self, under_way=rest)
         free = None if mine.done() else next((i for i, f in rest.items() if f.cancel()), None)
         if free is not None:
             rest[free] = Future()
             rest[free].set_result(self.work(free))
-        return mine.result(), Ahead(self.work, rest)
+        return mine.result(), replace(self, under_way=rest)

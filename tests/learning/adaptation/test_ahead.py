@@ -5,7 +5,7 @@ import threading
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learning.ahead import Ahead
+from learning.adaptation.ahead import Ahead
 
 
 def square(k: int) -> int:

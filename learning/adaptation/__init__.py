@@ -1,0 +1,1 @@
+"""What the main method does with its time: in which order, on which core, from which guesses."""
