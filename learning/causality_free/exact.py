@@ -14,20 +14,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from learning.causality_free.sidestep import sidesteps
-from ocp.compiled.batch import running_costs
+from learning.causality_free.sidestep import Sidesteps, nearness
+from ocp.compiled.batch import optimal_inputs, running_costs
 from ocp.extremals.extremal import SEGMENTS, find_extremal
 from ocp.extremals.transversality import quadratic_condition
 from ocp.extremals.warm_start import advanced
 from ocp.query import Query
 from ocp.regulation import RegulatorValue, regulator
 from ocp.trajectory import Status, Trajectory
-from ocp.value import Value, greedy
+from ocp.value import Value
 
 Array = NDArray[np.float64]
 
 TAIL = 3e-4  # of the cost, that may be left where the linear regulator takes over
 LONGEST = 20.0  # seconds of a guess
+DETOUR = 1.7  # times the longest motion known, that one past another side may last
 STEP = 0.02  # seconds of a guess's step, at most
 STEP_TOLERANCE = 1e-11  # of the integration
 GROWTH, MAX_SEGMENTS = 1.5, 200  # exponent by which errors may grow in a segment; how many
@@ -55,20 +56,23 @@ class Optimum:
         return float(self.values[0])
 
 
-def closed_loops(query: Query, value: Value, starts: ArrayLike) -> list[Trajectory | None]:
+def closed_loops(
+    query: Query, value: Value, starts: ArrayLike, longest: float = LONGEST
+) -> list[Trajectory | None]:
     """Rough closed loops of a value's greedy policy from states `[k, n]`, all advanced together.
 
-    They end on the linear regulator's ellipsoid; `None` where one does not get there.
+    They end on the linear regulator's ellipsoid; `None` where one is not there after `longest`
+    seconds.
     """
     states = np.array(np.atleast_2d(np.asarray(starts, dtype=float)))
     count, ends = len(states), RegulatorValue(query)
     step = min(STEP, 0.2 / _fastest_rate(query))
-    policy = greedy(query, value)
-    path, inputs, costs = [states], [], [np.zeros(count)]
+    path, costates, inputs, costs = [states], [], [], [np.zeros(count)]
     last = np.full(count, -1)
     lost = np.zeros(count, dtype=bool)
-    for k in range(int(LONGEST / step)):
-        u = policy(states)
+    for k in range(int(longest / step)):
+        costates.append(value.gradient(states))
+        u = optimal_inputs(query, states, costates[-1])
         inputs.append(u)
         now = costs[-1] + step * running_costs(query, states, u)
         going = ~lost & (last < 0)
@@ -84,6 +88,7 @@ def closed_loops(query: Query, value: Value, starts: ArrayLike) -> list[Trajecto
         last[arrived] = k + 1
         if (lost | (last >= 0)).all():
             break
+    costates.append(value.gradient(states))
     found: list[Trajectory | None] = []
     for i, end in enumerate(last):
         if end < 0:
@@ -92,10 +97,9 @@ def closed_loops(query: Query, value: Value, starts: ArrayLike) -> list[Trajecto
         xs = np.array([p[i] for p in path[: end + 1]])
         us = np.array([u[i] for u in [*inputs, inputs[-1]][: end + 1]])
         cost = np.array([c[i] for c in costs[: end + 1]])
-        costates = value.gradient(xs)
-        found.append(
-            Trajectory(step * np.arange(end + 1), xs, us, costates, cost, Status.NOT_CONVERGED)
-        )
+        ps = np.array([p[i] for p in costates[: end + 1]])
+        times = step * np.arange(end + 1)
+        found.append(Trajectory(times, xs, us, ps, cost, Status.NOT_CONVERGED))
     return found
 
 
@@ -214,20 +218,26 @@ def among_growing_obstacles(query: Query, value: Value, start: Array) -> Optimum
 
 
 def _cheapest_way(query: Query, found: list[Optimum | None], starts: Array) -> list[Optimum | None]:
+    """Each motion held against those that pass the obstacles it feels on either side."""
+    ways = [
+        (i, k, side)
+        for i, optimum in enumerate(found)
+        for k, obstacle in enumerate(query.obstacles)
+        if optimum is None or nearness(query, obstacle, optimum.motion.states) > FELT
+        for side in (1, -1)
+    ]
     best = list(found)
-    for way in sidesteps(query):
-        felt = [
-            i
-            for i, optimum in enumerate(found)
-            if optimum is None or way.nearness(optimum.motion.states) > FELT
-        ]
-        if not felt:
-            continue
-        for i, guess in zip(felt, closed_loops(query, way, starts[felt]), strict=True):
-            rival = None if guess is None else exact_from(query, guess)
-            mine = best[i]
-            if rival is not None and (mine is None or rival.cost < mine.cost):
-                best[i] = rival
+    if not ways:
+        return best
+    rows, passed, sides = (np.array(column) for column in zip(*ways, strict=True))
+    known = [LONGEST if o is None else DETOUR * o.motion.duration for o in found]
+    longest = min(LONGEST, max(known[i] for i in rows))
+    guesses = closed_loops(query, Sidesteps(query, passed, sides), starts[rows], longest)
+    for i, guess in zip(rows, guesses, strict=True):
+        rival = None if guess is None else exact_from(query, guess)
+        mine = best[i]
+        if rival is not None and (mine is None or rival.cost < mine.cost):
+            best[i] = rival
     return best
 
 

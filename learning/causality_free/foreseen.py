@@ -33,10 +33,17 @@ HALVES = (0.0, 0.25)  # the integrals start at these shares of the time
 
 @dataclass(frozen=True, eq=False)
 class _Flow:
-    """Along the regulator's motion: times' weights `[t]`, positions `[t, d, n]` of unit offsets."""
+    """Along the regulator's motion.
 
-    weights: Array
+    Attributes:
+        positions: `[t d, n]`, of unit offsets.
+        weights: `[t, f]`, of the times in the integrals from each share of the time on.
+        weighted: `[f, t d, n]`, positions times weights.
+    """
+
     positions: Array
+    weights: Array
+    weighted: Array
 
 
 @lru_cache(maxsize=256)
@@ -48,9 +55,15 @@ def _flow(query: Query) -> _Flow:
     inverse = np.linalg.inv(modes)
     place = list(query.system.position)
     moved = np.einsum("ij,tj,jk->tik", modes[place], np.exp(np.outer(times, rates)), inverse)
-    weights = np.full(NODES, times[1])
-    weights[[0, -1]] /= 2
-    return _Flow(weights, np.ascontiguousarray(moved.real))
+    simple = np.full(NODES, times[1])
+    simple[[0, -1]] /= 2
+    later = np.arange(NODES)[:, None] >= NODES * np.array(HALVES)
+    weights = np.where(later, simple[:, None], 0.0)
+    weighted = np.einsum("tf,tdn->ftdn", weights, moved.real)
+    n = len(rates)
+    return _Flow(
+        moved.real.reshape(-1, n).copy(), weights, weighted.reshape(len(HALVES), -1, n).copy()
+    )
 
 
 def foreseen(query: Query, offsets: Array) -> tuple[Array, Array]:
@@ -62,16 +75,14 @@ def foreseen(query: Query, offsets: Array) -> tuple[Array, Array]:
     if not query.obstacles:
         return np.zeros((count, 0)), np.zeros((count, n, 0))
     flow, cost = _flow(query), query.cost
-    p = np.einsum("tdn,kn->ktd", flow.positions, offsets)
+    p = (offsets @ flow.positions.T).reshape(count, NODES, -1)
     columns: list[Array] = []
     slopes: list[Array] = []
 
     def integrated(value: Array, slope: Array) -> None:
-        """A feature from its integrand `[k, t]`, and its derivative by position `[k, t, d]`."""
-        for share in HALVES:
-            weights = np.where(np.arange(NODES) >= share * NODES, flow.weights, 0.0)
-            columns.append(value @ weights)
-            slopes.append(np.einsum("ktd,t,tdn->kn", slope, weights, flow.positions))
+        """Features from an integrand `[k, t]` and its derivative by position `[k, t, d]`."""
+        columns.extend((value @ flow.weights).T)
+        slopes.extend(slope.reshape(count, -1) @ weighted for weighted in flow.weighted)
 
     for width in WIDTHS:
         integrand, by_place = np.zeros(p.shape[:2]), np.zeros_like(p)

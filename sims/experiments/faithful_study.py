@@ -259,7 +259,8 @@ CHANGES: dict[str, dict[str, dict[str, Any]]] = {
     "fewer outer samples": {"meta": {"outer_shots": 64}},
     "more outer samples": {"meta": {"outer_shots": 1024}},
     "beta = 0.0003": {"meta": {"outer_rate": 3e-4}},
-    "beta = 0.003": {"meta": {"outer_rate": 3e-3}},
+    "beta = 0.001": {"meta": {"outer_rate": 1e-3}},
+    "beta = 0.01": {"meta": {"outer_rate": 1e-2}},
     "beta constant": {"meta": {"final_rate": 1.0}},
     "interval 0.05 s": {"adaptation": {"interval": 0.05}},
     "interval 0.2 s": {"adaptation": {"interval": 0.2}},
@@ -272,8 +273,14 @@ CHANGES: dict[str, dict[str, dict[str, Any]]] = {
 """Single changes by name: section of the configuration, fields, new values."""
 
 
-def changed(config: Config, change: dict[str, dict[str, Any]]) -> Config:
-    """`config` with some fields replaced."""
+def changed(config: Config, name: str) -> Config:
+    """`config` after a change of `CHANGES`, or after several: "one + another"."""
+    for single in name.split(" + "):
+        config = _with_fields(config, CHANGES[single])
+    return config
+
+
+def _with_fields(config: Config, change: dict[str, dict[str, Any]]) -> Config:
     for section, values in change.items():
         config = replace(config, **{section: replace(getattr(config, section), **values)})
     return config
@@ -281,7 +288,7 @@ def changed(config: Config, change: dict[str, dict[str, Any]]) -> Config:
 
 def check_names(names: Sequence[str]) -> None:
     """Raise ValueError for a change that is not in `CHANGES`."""
-    for name in names:
+    for name in " + ".join(names).split(" + "):
         if name not in CHANGES:
             raise ValueError(f"changes: {name!r} is unknown; known are {', '.join(CHANGES)}")
 
@@ -308,7 +315,7 @@ class Evaluate:
             weights = MetaWeights.load(path)
             for name in self.changes:
                 title = f"{path}: {weights.iterations} meta-iterations; changes: {name}"
-                other = replace(weights, config=changed(weights.config, CHANGES[name]))
+                other = replace(weights, config=changed(weights.config, name))
                 show(evaluate(other, trials, self.counts), title, self.json)
 
 
@@ -321,7 +328,7 @@ class Ablate:
     out: Path
     """Folder for weights; a run that was stopped goes on."""
     changes: tuple[str, ...] = tuple(CHANGES)
-    """Names in `CHANGES`, one training each."""
+    """Names in `CHANGES`, or several of them joined by " + "; one training each."""
     hidden: tuple[int, ...] = ()
     """Widths instead of the configuration's."""
     iterations: int = 0
@@ -337,12 +344,12 @@ class Ablate:
         check_names(self.changes)
         base = Config.load(self.config)
         if self.iterations:
-            base = changed(base, {"meta": {"iterations": self.iterations}})
+            base = _with_fields(base, {"meta": {"iterations": self.iterations}})
         if self.hidden:
-            base = changed(base, {"network": {"hidden": self.hidden}})
+            base = _with_fields(base, {"network": {"hidden": self.hidden}})
         trials = fresh_trials(self.seed, self.queries, self.starts, max(self.counts))
         for name in self.changes:
-            config = changed(base, CHANGES[name])
+            config = changed(base, name)
             try:
                 path = train(config, self.out / name.replace(" ", "-"))
             except FloatingPointError as error:

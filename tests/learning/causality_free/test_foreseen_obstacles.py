@@ -8,7 +8,7 @@ import pytest
 from learning.causality_free.exact import closed_loops, exact_from, exact_trajectories
 from learning.causality_free.families import get_family, mirrored
 from learning.causality_free.foreseen import foreseen
-from learning.causality_free.sidestep import Sidestep, sidesteps
+from learning.causality_free.sidestep import Sidesteps
 from ocp.cost import RunningCost
 from ocp.obstacle import Obstacle
 from ocp.query import Equilibrium, Query
@@ -95,15 +95,15 @@ def test_sidesteps_pass_the_obstacle_on_their_sides() -> None:
     query = replace(query, obstacles=(Obstacle.circle((1.8, 0.0), 0.4),))
     start = np.array([3.2, 0.0, 0.0, 0.0])
     costs = []
-    for way in sidesteps(query):
-        guess = closed_loops(query, way, start)[0]
+    both = Sidesteps(query, passed=[0, 0], sides=[1, -1])
+    for side, guess in zip((1, -1), closed_loops(query, both, [start, start]), strict=True):
         assert guess is not None
         found = exact_from(query, guess)
         assert found is not None
         costs.append(found.cost)
         nearest = np.abs(found.motion.states[:, 0] - 1.8).argmin()
         # Left of it on the way to the goal, which lies at -x: y < 0.
-        assert np.sign(found.motion.states[nearest, 1]) == -np.sign(way.aim @ [0, -1])
+        assert np.sign(found.motion.states[nearest, 1]) == -side
     assert costs[0] == pytest.approx(costs[1], rel=1e-9)  # by symmetry
     through = closed_loops(query, RegulatorValue(query), start)[0]
     assert through is not None
@@ -116,9 +116,11 @@ def test_sidesteps_pass_the_obstacle_on_their_sides() -> None:
 
 def test_a_sidestep_aims_at_the_goal_once_the_obstacle_is_passed() -> None:
     query = integrator(1.0)
-    way = Sidestep(query, query.obstacles[0], 1)
     passed = np.array([[0.05, 0.02, 0.1, 0.0], [-3.0, 0.0, 0.1, 0.0]])
     before = np.array([[2.4, 0.3, 0.0, 0.0]])
     linear = RegulatorValue(query)
-    assert np.allclose(way.gradient(passed), linear.gradient(passed), atol=1e-4)
-    assert np.abs(way.gradient(before) - linear.gradient(before)).max() > 0.5
+    assert np.allclose(
+        Sidesteps(query, [0, 0], [1, 1]).gradient(passed), linear.gradient(passed), atol=1e-4
+    )
+    moved = Sidesteps(query, [0], [1]).gradient(before)
+    assert np.abs(moved - linear.gradient(before)).max() > 0.5
