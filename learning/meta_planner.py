@@ -126,6 +126,8 @@ class MetaPlanner:
         grids: whether to use grids at all; without, only network and exact trajectories.
         seconds: the deadline that plans will be given, if one. Then finer grids follow the exact
             trajectories as long as they end in time, and whatever is ready first is used first.
+        suspicion: a motion so many times as costly as a grid's loop from the same start is held
+            to be in the wrong class, and one beside the grid's is sought; infinite for never.
         cores: that it may occupy. Without a deadline the answer does not depend on how many.
         clock: the times that steps take.
 
@@ -141,19 +143,24 @@ class MetaPlanner:
     networks: tuple[Pretrained, ...]
     grids: bool = True
     seconds: float | None = None
+    suspicion: float = SUSPICION
     cores: int = field(default_factory=usable_cores)
     clock: Clock = field(default_factory=Clock)
 
     @classmethod
     def pretrained(
-        cls, name: str, grids: bool = True, seconds: float | None = None
+        cls,
+        name: str,
+        grids: bool = True,
+        seconds: float | None = None,
+        suspicion: float = SUSPICION,
     ) -> "MetaPlanner":
         """The planner on shipped weights, `paper` or `general`.
 
         Raises:
             ValueError: if there are no such weights, or they are damaged.
         """
-        return cls((load_pretrained(name),), grids, seconds)
+        return cls((load_pretrained(name),), grids, seconds, suspicion)
 
     @classmethod
     def shipped(cls, grids: bool = True, seconds: float | None = None) -> "MetaPlanner":
@@ -278,7 +285,7 @@ class MetaPlanner:
         answer, grids = state.grids.taken(nodes)
         outside = state.outside()
         costs, known = np.where(outside, answer.costs, 0.0), state.known_costs()
-        dearer = np.flatnonzero(outside & (known > SUSPICION * costs))
+        dearer = np.flatnonzero(outside & np.isfinite(costs) & (known > self.suspicion * costs))
         ratios = known[dearer] / costs[dearer]
         suspects = [int(i) for i in dearer[np.argsort(-ratios, kind="stable")]]
         state = replace(

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 BENCHMARKS: dict[str, str] = {
+    "ablation": "what each part of adapt buys, and what a grid does without learning",
     "brackets": "certified brackets of the optimal cost: how many hold, how wide they are",
     "causality-free": "values learned from exact trajectories alone, in five and six dimensions",
     "deadlines": "how late plans are ready against their deadline, over 10,000 calls",

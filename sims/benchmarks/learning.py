@@ -144,7 +144,7 @@ def run(seed: int, out: Path | None, queries: int = QUERIES, starts: int = START
             records = parts.get(
                 f"{name}-{k}",
                 {"starts": starts},
-                lambda k=k, family=family, methods=methods, warm=warm: _judged(
+                lambda k=k, family=family, methods=methods, warm=warm: judged(
                     problem(family, seed, k, starts), methods, warm
                 ),
             )
@@ -155,7 +155,7 @@ def run(seed: int, out: Path | None, queries: int = QUERIES, starts: int = START
         figures = {method: score.figures() for method, score in scores.items()}
         report.figures[name] = {**figures, "optima_missed": missed}
         title = f"{name}: {queries} queries x {starts} starts; {missed} optima by a loop"
-        report.tables.append(_table(title, figures))
+        report.tables.append(table_of(title, figures))
     return report
 
 
@@ -248,7 +248,7 @@ def eikonal(nodes: int, query: Query, _starts: list[NDArray[np.float64]]) -> tup
     return policy, time.perf_counter() - begun
 
 
-def _judged(
+def judged(
     posed: Problem, methods: dict[str, Solver], warm: set[str]
 ) -> dict[str, dict[str, list[Any]]]:
     """Each method's score on one problem; `warm` are those whose code is loaded already."""
@@ -268,7 +268,8 @@ def shown(figure: float | None, form: str, unit: float = 1.0) -> str:
     return "-" if figure is None else form.format(unit * figure)
 
 
-def _table(title: str, figures: dict[str, dict[str, float | None]]) -> Table:
+def table_of(title: str, figures: dict[str, dict[str, float | None]]) -> Table:
+    """Methods' figures for reading."""
     table = Table(title=title)
     columns = ("method", "reached", "aggregate", "median", "95 %", "largest", "new collisions")
     for column in (*columns, "median ms", "95 % ms"):
