@@ -24,7 +24,7 @@ from learning.adaptation.motions import (
     network_loops,
     solved_grid,
 )
-from learning.adaptation.schedule import COARSE, EARLY, READY, Clock, Step, steps
+from learning.adaptation.schedule import COARSE, FEW, READY, Clock, Step, steps
 from learning.conditioned.compiled_network import NetworkPolicy, NetworkValue
 from learning.conditioned.pretrained_weights import Pretrained, load_pretrained
 from learning.conditioned.query_encoder import QueryEncoder
@@ -59,7 +59,8 @@ class MetaState:
         grids: grids under way on other cores.
         extremals: the best exact trajectory from each start, or `None`.
         suspects: starts from which a grid's loop is in a better class of motions than what is
-            known.
+            known, or a better guess than one that led nowhere.
+        tried: starts from which the network's loop has been the guess.
         nodes: of the grid behind `base`; 0 if it is the network's.
         grid: the last grid solved.
         trajectories: exact trajectories used.
@@ -80,6 +81,7 @@ class MetaState:
     grids: Ahead[GridAnswer]
     extremals: tuple[Extremal | None, ...]
     suspects: frozenset[int] = frozenset()
+    tried: frozenset[int] = frozenset()
     nodes: int = 0
     grid: GridAnswer | None = None
     trajectories: int = 0
@@ -114,7 +116,8 @@ class MetaState:
         """For the exact trajectory from the i-th start."""
         doubted = i in self.suspects or self.loops[i] is None
         motion = self.grid.motions[i] if self.grid is not None and doubted else None
-        return Search(self.query, self.starts[i], self.loops[i], motion, self.extremals[i])
+        loop = None if i in self.tried else self.loops[i]
+        return Search(self.query, self.starts[i], loop, motion, self.extremals[i])
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,7 @@ class MetaPlanner:
             raise SolveError(Status.NOT_APPLICABLE, "the network was trained on other queries")
         network = NetworkValue(encoder, chosen.weights)
         rows = np.array(starts, dtype=float).reshape(-1, query.system.n)
+        pending = steps(len(rows), self.grids, self.seconds is not None)
         loops = network_loops(network, rows, self.cores)
         costs = np.array([np.inf if loop is None else loop.cost for loop in loops])
         state = MetaState(
@@ -203,7 +207,7 @@ class MetaPlanner:
             (NetworkPolicy(network), network),
             np.where(query.goal_distance(rows) > 0, costs, 0.0),
             chosen.worth_nodes,
-            steps(len(rows), self.grids, self.seconds is not None),
+            pending,
             Ahead(_unknown),
             Ahead(partial(solved_grid, query, rows)),
             (None,) * len(rows),
@@ -242,10 +246,9 @@ class MetaPlanner:
         if self.cores < 2:
             return state
         exact = [s.start for s in (step, *state.pending) if not s.nodes]
-        grid = next((s for s in state.pending if s.nodes), None)
-        grids = state.grids
-        if grid is not None and len(exact) <= EARLY and self._ends_in_time(state, grid):
-            grids = grids.begun([grid.nodes], 1)
+        grids, later = state.grids, next((s for s in state.pending if s.nodes), None)
+        if later is not None and len(exact) <= FEW and self._ends_in_time(state, later):
+            grids = grids.begun([later.nodes], 1)
         known = (i for i in exact if i < state.asked and _is_to_be_sought(state, i))
         return replace(state, grids=grids, exact=state.exact.begun(known, self.cores + 1))
 
@@ -256,18 +259,19 @@ class MetaPlanner:
     def _ordered(self, state: MetaState) -> MetaState:
         """The state with the time that its next step will take.
 
-        Under a deadline a grid is next as soon as another core has finished it, or if nothing else
+        Under a deadline that is a grid which another core has finished, else the first step that
         ends in time.
         """
         if not state.pending:
             return replace(state, next_seconds=0.0)
         first = state.pending[0]
-        under_way = next((s for s in state.pending if s.nodes in state.grids.under_way), None)
-        if self.seconds is not None and under_way is not None:
-            late = time.perf_counter() - state.begun + self._left(state, first) > self.seconds
-            if late or state.grids.ready(under_way.nodes):
-                others = (s for s in state.pending if s is not under_way)
-                first, state = under_way, replace(state, pending=(under_way, *others))
+        if self.seconds is not None:
+            left = state.begun + self.seconds - time.perf_counter()
+            ready = (s for s in state.pending if s.nodes and state.grids.ready(s.nodes))
+            timely = (s for s in state.pending if self._left(state, s) <= left)
+            first = next(ready, None) or next(timely, first)
+            others = tuple(s for s in state.pending if s is not first)
+            state = replace(state, pending=(first, *others))
         return replace(state, next_seconds=self._left(state, first))
 
     def _left(self, state: MetaState, step: Step) -> float:
@@ -285,9 +289,10 @@ class MetaPlanner:
         answer, grids = state.grids.taken(nodes)
         outside = state.outside()
         costs, known = np.where(outside, answer.costs, 0.0), state.known_costs()
-        dearer = np.flatnonzero(outside & np.isfinite(costs) & (known > self.suspicion * costs))
-        ratios = known[dearer] / costs[dearer]
-        suspects = [int(i) for i in dearer[np.argsort(-ratios, kind="stable")]]
+        failed = [i in state.tried and e is None for i, e in enumerate(state.extremals)]
+        ratios = np.where(failed[: state.asked], np.inf, known / np.maximum(costs, 1e-12))
+        doubted = outside & np.isfinite(costs) & (ratios > self.suspicion)
+        suspects = [int(i) for i in np.argsort(-ratios, kind="stable") if doubted[i]]
         state = replace(
             state,
             suspects=frozenset(suspects),
@@ -331,6 +336,7 @@ class MetaPlanner:
             state,
             extremals=tuple(extremals),
             suspects=state.suspects - {i},
+            tried=state.tried | {i},
             trajectories=state.trajectories + any(e.trajectory is not None for e in found),
         )
 

@@ -205,23 +205,43 @@ def plan(
     checked = [query.check_start(s) for s in starts]
     until = until or iterations(8)
     begun = time.perf_counter()
-    state = planner.start(query, checked)
-    done = 0
-    while not state.finished and not until.satisfied(
-        Progress(time.perf_counter() - begun + state.next_seconds, done, state.trajectories)
-    ):
-        better = _refined(planner, state, begun + until.seconds)
-        if better is None:
-            log.info("refinement %d is late and left out", done + 1)
-            break
-        state = better
-        done += 1
+    work = _Refinement(planner, until, begun, planner.start(query, checked))
+    if until.seconds == math.inf:
+        work.run()
+    elif in_time(work.run, begun + until.seconds - time.perf_counter()) is None:
+        work.given_up = True
+        log.info("refinement %d is late and left out", work.done + 1)
+    state = work.state
     policy, value = planner.policy(state), planner.value(state)
     return Plan(query, policy, value, time.perf_counter() - begun, state.trajectories)
 
 
-def _refined(planner: Planner, state: Any, end: float) -> Any:
-    """The next state, or `None` if it is not there at the time `end`."""
-    if end == math.inf:
-        return planner.refine(state)
-    return in_time(lambda: planner.refine(state), end - time.perf_counter())
+@dataclass
+class _Refinement:
+    """The loop of `plan`: on a thread of its own under a deadline, one for all its steps.
+
+    Attributes:
+        state: the best so far.
+        done: refinements.
+        given_up: nobody waits any more.
+    """
+
+    planner: Planner
+    until: Until
+    begun: float
+    state: Any
+    done: int = 0
+    given_up: bool = False
+
+    def run(self) -> bool:
+        """Refine until the rule holds or nothing more is to be gained; true at the end."""
+        while not (self.given_up or self.state.finished or self._is_enough()):
+            better = self.planner.refine(self.state)
+            if not self.given_up:
+                self.state = better
+                self.done += 1
+        return True
+
+    def _is_enough(self) -> bool:
+        seconds = time.perf_counter() - self.begun + self.state.next_seconds
+        return self.until.satisfied(Progress(seconds, self.done, self.state.trajectories))

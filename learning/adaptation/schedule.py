@@ -1,13 +1,14 @@
 """The refinements of a plan: which there are, in which order, and how long each takes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 
-COARSE = 4_500  # nodes of the grid that answers where the network's check fails
-GRIDS = (18_000, 60_000, 240_000)
+USUAL = {4_500: 3e-3, 18_000: 8e-3, 60_000: 28e-3, 240_000: 125e-3}
+"""Nodes, and the seconds that one solve usually takes: only ratios matter."""
+COARSE, *GRIDS = USUAL  # the coarse one answers where the network's check fails
 TRAJECTORIES = 8  # exact ones, from states of the planner's choice if no starts are asked for
-EARLY = 4  # so many starts are solved exactly before any grid; the grid comes from another core
-CAUTION = 1.3  # by how much a step's expected time is overestimated
+FEW = 4  # exact trajectories left to one core while another solves the next grid
+CAUTION = 1.2  # by how much a step's expected time is overestimated
 OUTLIER = 4.0  # a step's time counts for at most so many times what was expected
 READY = 3e-4  # seconds to take up what another core has finished
 
@@ -23,6 +24,8 @@ class Step:
 def steps(asked: int, grids: bool, patient: bool) -> tuple[Step, ...]:
     """What there is to do for so many starts asked for.
 
+    A grid comes first: it tells from which starts the network's loop is in a wrong class.
+
     Args:
         asked: starts; without any, the planner chooses its own.
         grids: whether grids are allowed.
@@ -32,8 +35,7 @@ def steps(asked: int, grids: bool, patient: bool) -> tuple[Step, ...]:
     exact = [Step(start=i) for i in range(asked or TRAJECTORIES)]
     if asked and asked <= TRAJECTORIES and not patient:
         finer = []
-    begin = [*exact, *coarse] if 0 < asked <= EARLY else [*coarse, *exact]
-    return (*begin, *chain(*finer))
+    return (*coarse, *exact, *chain(*finer))
 
 
 @dataclass
@@ -42,31 +44,36 @@ class Clock:
 
     Attributes:
         trajectory: seconds of an exact one.
-        grid: seconds of a grid before its first node.
-        node: seconds a node.
         motion: seconds of a grid's closed loop.
+        pace: a grid's time over the usual one.
+        doubted: whether the last time of a trajectory, of a grid was out of all proportion.
     """
 
     trajectory: float = 3e-3
-    grid: float = 2.0e-3
-    node: float = 0.5e-6
     motion: float = 0.4e-3
+    pace: float = 1.0
+    doubted: dict[bool, bool] = field(default_factory=lambda: {False: False, True: False})
 
     def expected(self, step: Step, motions: int = 0) -> float:
         """Seconds, with caution; a grid's with so many of its closed loops."""
         if step.nodes:
-            return CAUTION * (self.grid + self.node * step.nodes + self.motion * motions)
+            return CAUTION * (self.pace * USUAL[step.nodes] + self.motion * motions)
         return CAUTION * self.trajectory
 
     def learn(self, step: Step, seconds: float, motions: int = 0) -> None:
         """Take note of a step's time.
 
-        An outlier counts in part only: the first step also loads code, and whoever believed that
-        time would never take a step before a deadline again, and so never learn better.
+        A time out of all proportion is believed only if the next one is so too, and then in part:
+        the first step also loads code, and whoever believed that time would never take a step
+        before a deadline again, and so never learn better.
         """
-        seconds = min(seconds, OUTLIER * self.expected(step, motions) / CAUTION)
-        if step.nodes:
-            nodes = max(seconds - self.grid - self.motion * motions, 0.0)
-            self.node += 0.5 * (nodes / step.nodes - self.node)
+        most, grid = OUTLIER * self.expected(step, motions) / CAUTION, bool(step.nodes)
+        believed, self.doubted[grid] = seconds <= most or self.doubted[grid], seconds > most
+        if not believed:
+            return
+        seconds = min(seconds, most)
+        if grid:
+            pace = max(seconds - self.motion * motions, 0.0) / USUAL[step.nodes]
+            self.pace += 0.5 * (pace - self.pace)
         else:
             self.trajectory += 0.3 * (seconds - self.trajectory)

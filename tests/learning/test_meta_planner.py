@@ -137,6 +137,23 @@ def test_starts_that_a_grid_knows_better_motions_from_come_first(problem, cores)
     assert extremal.cost == pytest.approx(optima[3], rel=1e-4)
 
 
+def test_a_search_that_failed_is_made_again_from_the_next_grids_loop(problem):
+    """And not from the network's loop, which led nowhere."""
+    name, query, starts, optima = problem
+    planner = MetaPlanner.pretrained(name)
+    state = planner.start(query, starts)
+    grid, *rest = sorted(state.pending, key=lambda step: step.nodes == 0)
+    assert all(step.nodes == 0 for step in rest)
+    state = planner.refine(replace(state, tried=frozenset({2}), pending=(grid,)))
+    assert 2 in state.suspects
+    assert state.search(2).loop is None
+    while not state.finished:
+        state = planner.refine(state)
+    extremal = state.extremals[2]
+    assert extremal is not None
+    assert extremal.cost == pytest.approx(optima[2], rel=1e-4)
+
+
 def test_a_grid_becomes_the_base_only_if_its_own_loops_are_better(problem):
     name, query, starts, _ = problem
     planner = MetaPlanner.pretrained(name)
@@ -165,14 +182,14 @@ def test_a_start_in_the_goal_needs_nothing(problem):
 
 
 def test_only_a_deadline_lets_fine_grids_follow_few_trajectories():
-    assert schedule.steps(4, grids=True, patient=False)[-1] == Step(nodes=18_000)
+    assert max(s.nodes for s in schedule.steps(4, grids=True, patient=False)) == 18_000
     assert schedule.steps(4, grids=True, patient=True)[-1] == Step(nodes=240_000)
     for asked in (0, 1, 4, 5, 20):
         for patient in (False, True):
             steps = schedule.steps(asked, grids=True, patient=patient)
             exact = [s.start for s in steps if not s.nodes]
             assert exact == list(range(asked or schedule.TRAJECTORIES))
-            assert (steps[0] == Step(nodes=18_000)) == (asked not in (1, 4))
+            assert steps[0] == Step(nodes=18_000)
             alone = schedule.steps(asked, grids=False, patient=patient)
             assert [s.start for s in alone] == exact
 
@@ -202,9 +219,9 @@ def test_a_step_is_not_begun_that_would_end_late():
     clock = Clock()
     for _ in range(20):
         clock.learn(Step(start=0), 0.5)
-        clock.learn(Step(nodes=10_000), 0.1)
+        clock.learn(Step(nodes=18_000), 0.1)
     assert clock.expected(Step(start=0)) >= 0.45
-    assert clock.expected(Step(nodes=20_000)) >= 0.15
+    assert clock.expected(Step(nodes=60_000)) >= 0.25
     state = MetaPlanner.pretrained("paper").start(paper_query((1.0, 4.0)), [np.array(PAPER_START)])
     assert state.next_seconds > 0
 
@@ -269,7 +286,7 @@ def test_one_slow_step_does_not_end_all_others(step: Step) -> None:
     clock = Clock()
     usual = clock.expected(step)
     clock.learn(step, 5.0)
-    assert usual < clock.expected(step) < 3 * usual
+    assert clock.expected(step) == usual
     for _ in range(20):
         clock.learn(step, 10 * usual)
-    assert clock.expected(step) == pytest.approx(13 * usual, rel=0.05)
+    assert clock.expected(step) == pytest.approx(12 * usual, rel=0.05)
