@@ -10,26 +10,19 @@ machine's other cores.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from learning.adaptation.ahead import Ahead
-from learning.adaptation.motions import (
-    SUSPICION,
-    GridAnswer,
-    Loop,
-    Search,
-    network_loops,
-    solved_grid,
-)
+from learning.adaptation.motions import SUSPICION, network_loops, solved_grid
 from learning.adaptation.schedule import COARSE, FEW, READY, Clock, Step, steps
+from learning.adaptation.state import MetaState, unknown
 from learning.conditioned.compiled_network import NetworkPolicy, NetworkValue
 from learning.conditioned.pretrained_weights import Pretrained, load_pretrained
 from learning.conditioned.query_encoder import QueryEncoder
-from learning.conditioned.tube import TubePolicy, Tubes, TubeValue
-from ocp.extremals.extremal import Extremal
+from learning.conditioned.tube import TubePolicy, TubeValue
 from ocp.planning import Plan, Until, plan
 from ocp.query import Query
 from ocp.query_family import sample_start
@@ -38,86 +31,6 @@ from ocp.trajectory import SolveError, Status
 from ocp.value import Policy, Value
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class MetaState:
-    """What is known of a query so far; see `ocp.planning.PlannerState`.
-
-    Attributes:
-        query: the query.
-        network: its network's value.
-        starts: `[k, n]`, those asked for, then those of the planner's own choice.
-        asked: how many were asked for.
-        begun: when, seconds of `time.perf_counter`.
-        loops: the network's closed loop from each start; `None` if it does not get to the goal.
-        base: policy and value off the tubes.
-        base_costs: `[asked]`, of the closed loops of `base`; infinite where one does not arrive.
-        worth_nodes: of a grid as good as the network.
-        pending: steps to come.
-        exact: exact trajectories under way on other cores.
-        grids: grids under way on other cores.
-        extremals: the best exact trajectory from each start, or `None`.
-        suspects: starts from which a grid's loop is in a better class of motions than what is
-            known, or a better guess than one that led nowhere.
-        tried: starts from which the network's loop has been the guess.
-        nodes: of the grid behind `base`; 0 if it is the network's.
-        grid: the last grid solved.
-        trajectories: exact trajectories used.
-        next_seconds: expected for the next step.
-    """
-
-    query: Query
-    network: NetworkValue
-    starts: Floats
-    asked: int
-    begun: float
-    loops: tuple[Loop | None, ...]
-    base: tuple[Policy, Value]
-    base_costs: Floats
-    worth_nodes: int
-    pending: tuple[Step, ...]
-    exact: Ahead[list[Extremal]]
-    grids: Ahead[GridAnswer]
-    extremals: tuple[Extremal | None, ...]
-    suspects: frozenset[int] = frozenset()
-    tried: frozenset[int] = frozenset()
-    nodes: int = 0
-    grid: GridAnswer | None = None
-    trajectories: int = 0
-    next_seconds: float = 0.0
-
-    @property
-    def finished(self) -> bool:
-        return not self.pending
-
-    @cached_property
-    def tubes(self) -> Tubes | None:
-        """Around the exact trajectories found, if there are any."""
-        solved = [e for e in self.extremals if e is not None]
-        return Tubes.around(self.query, solved) if solved else None
-
-    def outside(self) -> NDArray[np.bool_]:
-        """Whether each start asked for is outside the goal."""
-        return np.asarray(self.query.goal_distance(self.starts[: self.asked]) > 0)
-
-    def known_costs(self) -> Floats:
-        """Of the cheapest motion known from each start asked for, a grid's apart."""
-        return np.array(
-            [
-                extremal.cost if extremal is not None else loop.cost if loop else np.inf
-                for loop, extremal in zip(
-                    self.loops[: self.asked], self.extremals[: self.asked], strict=True
-                )
-            ]
-        )
-
-    def search(self, i: int) -> Search:
-        """For the exact trajectory from the i-th start."""
-        doubted = i in self.suspects or self.loops[i] is None
-        motion = self.grid.motions[i] if self.grid is not None and doubted else None
-        loop = None if i in self.tried else self.loops[i]
-        return Search(self.query, self.starts[i], loop, motion, self.extremals[i])
 
 
 @dataclass(frozen=True)
@@ -208,11 +121,11 @@ class MetaPlanner:
             np.where(query.goal_distance(rows) > 0, costs, 0.0),
             chosen.worth_nodes,
             pending,
-            Ahead(_unknown),
+            Ahead(unknown),
             Ahead(partial(solved_grid, query, rows)),
             (None,) * len(rows),
         )
-        state = replace(state, exact=_searches(state))
+        state = state.with_searches()
         if self.grids and np.isinf(state.base_costs).any():
             state = self._grid(state, COARSE)
         return self._ordered(state)
@@ -249,7 +162,7 @@ class MetaPlanner:
         grids, later = state.grids, next((s for s in state.pending if s.nodes), None)
         if later is not None and len(exact) <= FEW and self._ends_in_time(state, later):
             grids = grids.begun([later.nodes], 1)
-        known = (i for i in exact if i < state.asked and _is_to_be_sought(state, i))
+        known = (i for i in exact if i < state.asked and state.is_to_be_sought(i))
         return replace(state, grids=grids, exact=state.exact.begun(known, self.cores + 1))
 
     def _ends_in_time(self, state: MetaState, step: Step) -> bool:
@@ -260,7 +173,7 @@ class MetaPlanner:
         """The state with the time that its next step will take.
 
         Under a deadline that is a grid which another core has finished, else the first step that
-        ends in time.
+        ends in time; a grid must leave time for a few exact trajectories, which buy more.
         """
         if not state.pending:
             return replace(state, next_seconds=0.0)
@@ -268,11 +181,19 @@ class MetaPlanner:
         if self.seconds is not None:
             left = state.begun + self.seconds - time.perf_counter()
             ready = (s for s in state.pending if s.nodes and state.grids.ready(s.nodes))
-            timely = (s for s in state.pending if self._left(state, s) <= left)
+            timely = (s for s in state.pending if self._fits(state, s, left))
             first = next(ready, None) or next(timely, first)
             others = tuple(s for s in state.pending if s is not first)
             state = replace(state, pending=(first, *others))
         return replace(state, next_seconds=self._left(state, first))
+
+    def _fits(self, state: MetaState, step: Step, left: float) -> bool:
+        """Whether a step ends in so many seconds; a grid together with a few exact trajectories."""
+        seconds = self._left(state, step)
+        if step.nodes:
+            exact = [s for s in state.pending if not s.nodes][:FEW]
+            seconds += sum(self.clock.expected(s) for s in exact) / self.cores
+        return seconds <= left
 
     def _left(self, state: MetaState, step: Step) -> float:
         """Seconds until the step is done, if it is taken now."""
@@ -285,29 +206,9 @@ class MetaPlanner:
         return expected
 
     def _grid(self, state: MetaState, nodes: int) -> MetaState:
-        """Solve a grid; starts that it knows cheaper motions from are the next to be solved."""
+        """Solve a grid."""
         answer, grids = state.grids.taken(nodes)
-        outside = state.outside()
-        costs, known = np.where(outside, answer.costs, 0.0), state.known_costs()
-        failed = [i in state.tried and e is None for i, e in enumerate(state.extremals)]
-        ratios = np.where(failed[: state.asked], np.inf, known / np.maximum(costs, 1e-12))
-        doubted = outside & np.isfinite(costs) & (ratios > self.suspicion)
-        suspects = [int(i) for i in np.argsort(-ratios, kind="stable") if doubted[i]]
-        state = replace(
-            state,
-            suspects=frozenset(suspects),
-            grid=answer,
-            grids=grids,
-            pending=(
-                *(Step(start=i) for i in suspects),
-                *(step for step in state.pending if step.start not in suspects),
-            ),
-        )
-        state = replace(state, exact=_searches(state))
-        if not _is_better(state, costs, nodes):
-            return state
-        base = (answer.policy, answer.solution.value)
-        return replace(state, base=base, base_costs=costs, nodes=nodes)
+        return replace(state, grids=grids).with_grid(answer, nodes, self.suspicion)
 
     def _exact(self, state: MetaState, i: int) -> MetaState:
         """The exact trajectory from the i-th start, kept if it is the cheapest known from there."""
@@ -320,58 +221,9 @@ class MetaPlanner:
                 loops=(*state.loops, *network_loops(state.network, own[None], self.cores)),
                 extremals=(*state.extremals, None),
             )
-        if query.goal_distance(state.starts[i]) <= 0 or not _is_to_be_sought(state, i):
+        if query.goal_distance(state.starts[i]) <= 0 or not state.is_to_be_sought(i):
             return state
-        if i < state.asked:
-            found, exact = state.exact.taken(i)
-            state = replace(state, exact=exact)
-        else:
-            found = state.search(i).found()
-        known = state.extremals[i]
-        candidates = found if known is None else [*found, known]
-        best = min(candidates, key=lambda extremal: extremal.cost)
-        extremals = list(state.extremals)
-        extremals[i] = best if best.trajectory is not None else None
-        return replace(
-            state,
-            extremals=tuple(extremals),
-            suspects=state.suspects - {i},
-            tried=state.tried | {i},
-            trajectories=state.trajectories + any(e.trajectory is not None for e in found),
-        )
-
-
-def _unknown(i: int) -> list[Extremal]:
-    raise AssertionError(f"start {i}: nothing is known yet")
-
-
-def _searches(state: MetaState) -> Ahead[list[Extremal]]:
-    """The searches from the starts asked for, with all that is known now.
-
-    Those under way go on; from suspects they begin anew, for there is a better guess.
-    """
-    searches = tuple(state.search(i) for i in range(state.asked))
-    return replace(state.exact.without(state.suspects), work=lambda i: searches[i].found())
-
-
-def _is_to_be_sought(state: MetaState, i: int) -> bool:
-    """Whether there is a guess from the i-th start that no search has used."""
-    search = state.search(i)
-    fresh = search.loop is not None and search.known is None
-    return fresh or search.motion is not None
-
-
-def _is_better(state: MetaState, costs: Floats, nodes: int) -> bool:
-    """Whether a grid of so many `nodes` whose closed loops cost so much should be the base.
-
-    Its loops tell, from starts outside the tubes: more of them arrive, or all together they cost
-    less. Where there are no such starts its size tells.
-    """
-    free = [i for i in range(state.asked) if state.extremals[i] is None]
-    if not free:
-        return nodes > max(state.nodes, state.worth_nodes)
-    ours, theirs = state.base_costs[free], costs[free]
-    lost, kept = np.isinf(theirs).sum(), np.isinf(ours).sum()
-    if lost != kept:
-        return bool(lost < kept)
-    return bool(theirs[np.isfinite(theirs)].sum() < ours[np.isfinite(ours)].sum())
+        if i >= state.asked:
+            return state.with_found(i, state.search(i).found())
+        found, exact = state.exact.taken(i)
+        return replace(state, exact=exact).with_found(i, found)

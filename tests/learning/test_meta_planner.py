@@ -1,5 +1,6 @@
 """The main method: a planner's laws, deadlines, and what the shipped weights promise."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -192,6 +193,19 @@ def test_only_a_deadline_lets_fine_grids_follow_few_trajectories():
             assert steps[0] == Step(nodes=18_000)
             alone = schedule.steps(asked, grids=False, patient=patient)
             assert [s.start for s in alone] == exact
+
+
+def test_a_grid_must_leave_time_for_exact_trajectories(problem):
+    name, query, starts, _ = problem
+    clock = Clock()
+    grid = clock.expected(Step(nodes=18_000), len(starts))
+    exact = clock.expected(Step(start=0))
+    for seconds, first in ((1.0, True), (0.1 + grid + exact, False)):
+        planner = replace(MetaPlanner.pretrained(name, seconds=seconds), cores=1, clock=clock)
+        state = planner.start(query, starts)
+        begun = time.perf_counter() if first else time.perf_counter() - 0.1
+        state = planner._ordered(replace(state, begun=begun))
+        assert (state.pending[0].nodes > 0) == first
 
 
 @pytest.mark.parametrize("seconds", [0.02, 0.5])

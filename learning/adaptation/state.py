@@ -1,0 +1,166 @@
+"""What is known of a query, and how a grid or an exact trajectory is taken into it."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from learning.adaptation.ahead import Ahead
+from learning.adaptation.motions import GridAnswer, Loop, Search
+from learning.adaptation.schedule import Step
+from learning.conditioned.compiled_network import NetworkValue
+from learning.conditioned.tube import Tubes
+from ocp.extremals.extremal import Extremal
+from ocp.query import Query
+from ocp.value import Policy, Value
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MetaState:
+    """What is known of a query so far; see `ocp.planning.PlannerState`.
+
+    Attributes:
+        query: the query.
+        network: its network's value.
+        starts: `[k, n]`, those asked for, then those of the planner's own choice.
+        asked: how many were asked for.
+        begun: when, seconds of `time.perf_counter`.
+        loops: the network's closed loop from each start; `None` if it does not get to the goal.
+        base: policy and value off the tubes.
+        base_costs: `[asked]`, of the closed loops of `base`; infinite where one does not arrive.
+        worth_nodes: of a grid as good as the network.
+        pending: steps to come.
+        exact: exact trajectories under way on other cores.
+        grids: grids under way on other cores.
+        extremals: the best exact trajectory from each start, or `None`.
+        suspects: starts from which a grid's loop is in a better class of motions than what is
+            known, or a better guess than one that led nowhere.
+        tried: starts from which the network's loop has been the guess.
+        nodes: of the grid behind `base`; 0 if it is the network's.
+        grid: the last grid solved.
+        trajectories: exact trajectories used.
+        next_seconds: expected for the next step.
+    """
+
+    query: Query
+    network: NetworkValue
+    starts: Floats
+    asked: int
+    begun: float
+    loops: tuple[Loop | None, ...]
+    base: tuple[Policy, Value]
+    base_costs: Floats
+    worth_nodes: int
+    pending: tuple[Step, ...]
+    exact: Ahead[list[Extremal]]
+    grids: Ahead[GridAnswer]
+    extremals: tuple[Extremal | None, ...]
+    suspects: frozenset[int] = frozenset()
+    tried: frozenset[int] = frozenset()
+    nodes: int = 0
+    grid: GridAnswer | None = None
+    trajectories: int = 0
+    next_seconds: float = 0.0
+
+    @property
+    def finished(self) -> bool:
+        return not self.pending
+
+    @cached_property
+    def tubes(self) -> Tubes | None:
+        """Around the exact trajectories found, if there are any."""
+        solved = [e for e in self.extremals if e is not None]
+        return Tubes.around(self.query, solved) if solved else None
+
+    def search(self, i: int) -> Search:
+        """For the exact trajectory from the i-th start."""
+        doubted = i in self.suspects or self.loops[i] is None
+        motion = self.grid.motions[i] if self.grid is not None and doubted else None
+        loop = None if i in self.tried else self.loops[i]
+        return Search(self.query, self.starts[i], loop, motion, self.extremals[i])
+
+    def is_to_be_sought(self, i: int) -> bool:
+        """Whether there is a guess from the i-th start that no search has used."""
+        search = self.search(i)
+        fresh = search.loop is not None and search.known is None
+        return fresh or search.motion is not None
+
+    def with_searches(self) -> "MetaState":
+        """With the searches from the starts asked for, with all that is known now.
+
+        Those under way go on; from suspects they begin anew, for there is a better guess.
+        """
+        searches = tuple(self.search(i) for i in range(self.asked))
+        left = self.exact.without(self.suspects)
+        return replace(self, exact=replace(left, work=lambda i: searches[i].found()))
+
+    def with_grid(self, answer: GridAnswer, nodes: int, suspicion: float) -> "MetaState":
+        """With a grid of so many `nodes`; starts that it doubts are the next to be solved.
+
+        Those are starts whose motion costs `suspicion` times as much as the grid's loop, dearest
+        first, and those from which a search led nowhere.
+        """
+        outside = np.asarray(self.query.goal_distance(self.starts[: self.asked]) > 0)
+        costs, known = np.where(outside, answer.costs, 0.0), self._known_costs()
+        failed = [i in self.tried and self.extremals[i] is None for i in range(self.asked)]
+        ratios = np.where(failed, np.inf, known / np.maximum(costs, 1e-12))
+        doubted = outside & np.isfinite(costs) & (ratios > suspicion)
+        suspects = [int(i) for i in np.argsort(-ratios, kind="stable") if doubted[i]]
+        pending = (
+            *(Step(start=i) for i in suspects),
+            *(step for step in self.pending if step.start not in suspects),
+        )
+        state = replace(self, suspects=frozenset(suspects), grid=answer, pending=pending)
+        state = state.with_searches()
+        if not self._is_worse_than(costs, nodes):
+            return state
+        base = (answer.policy, answer.solution.value)
+        return replace(state, base=base, base_costs=costs, nodes=nodes)
+
+    def with_found(self, i: int, found: list[Extremal]) -> "MetaState":
+        """With what a search from the i-th start has found; the cheapest counts."""
+        known = self.extremals[i]
+        candidates = found if known is None else [*found, known]
+        best = min(candidates, key=lambda extremal: extremal.cost)
+        extremals = list(self.extremals)
+        extremals[i] = best if best.trajectory is not None else None
+        return replace(
+            self,
+            extremals=tuple(extremals),
+            suspects=self.suspects - {i},
+            tried=self.tried | {i},
+            trajectories=self.trajectories + any(e.trajectory is not None for e in found),
+        )
+
+    def _known_costs(self) -> Floats:
+        """Of the cheapest motion known from each start asked for, a grid's apart."""
+        asked = slice(0, self.asked)
+        return np.array(
+            [
+                extremal.cost if extremal is not None else loop.cost if loop else np.inf
+                for loop, extremal in zip(self.loops[asked], self.extremals[asked], strict=True)
+            ]
+        )
+
+    def _is_worse_than(self, costs: Floats, nodes: int) -> bool:
+        """Whether a grid of so many `nodes` whose closed loops cost so much should be the base.
+
+        Its loops tell, from starts outside the tubes: more of them arrive, or all together they
+        cost less. Where there are no such starts its size tells.
+        """
+        free = [i for i in range(self.asked) if self.extremals[i] is None]
+        if not free:
+            return nodes > max(self.nodes, self.worth_nodes)
+        ours, theirs = self.base_costs[free], costs[free]
+        lost, kept = np.isinf(theirs).sum(), np.isinf(ours).sum()
+        if lost != kept:
+            return bool(lost < kept)
+        return bool(theirs[np.isfinite(theirs)].sum() < ours[np.isfinite(ours)].sum())
+
+
+def unknown(i: int) -> list[Extremal]:
+    """The work of a search before anything is known."""
+    raise AssertionError(f"start {i}: nothing is known yet")
