@@ -44,7 +44,7 @@ class Loop:
 
 
 def network_loops(network: NetworkValue, starts: Floats, cores: int) -> tuple[Loop | None, ...]:
-    """The closed loops of a network's policy; `None` where one does not get to the goal.
+    """The closed loops of a network's policy from `[k, n]`; `None` where one does not arrive.
 
     Half of many starts are driven on another core. The halves are the same on a single one: in
     single precision a state's V depends, in its last digits, on those evaluated together with it.
