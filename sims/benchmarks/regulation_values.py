@@ -6,10 +6,12 @@ met fresh). Shooting starts from closed loops (the regulator's, the network's, t
 from collocation's motion; equations, meshes and quadratures are not shared. The error of every
 method is against the cheaper of the two. A slice goes through the goal in an angle
 and its rate; it is wider than the box that the network knows, and reaches where the pendulum's
-motor is too weak: there V has kinks, between swinging and not.
+motor is too weak: there V has kinks, between swinging and not. Network and regulator are also held
+against the exact V at random states of that box, off the slice.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,7 @@ from ocp.grid import Grid
 from ocp.grids.regulation_grid import solve_regulation_grid
 from ocp.query import Query
 from ocp.regulation import RegulatorValue, solve_regulation
-from ocp.trajectory import SolveError
+from ocp.trajectory import SolveError, Trajectory
 from ocp.value import Value
 from sims.benchmarks import Report
 
@@ -72,17 +74,27 @@ TRAINING = {
     "queries": 24, "held_out": 4, "motions": (16, 6), "steps": (1500, 3000), "widths": (32, 32),
     "batch": 256, "warm_up": 100, "checkpoint_steps": 1500,
 }  # fmt: skip
+RANDOM = 60  # states of the network's box
 METHODS = ("linear regulator", "grid", "finer grid", "network", "PMP", "collocation")
 
 
 @dataclass
 class Values:
-    """V by every method at the slice's states; NaN where a method has none."""
+    """V by every method at the slice's states; NaN where a method has none.
+
+    Attributes:
+        states: `[k, n]`.
+        inside: `[k]`, whether they are in the network's box.
+        of: V `[k]` by method.
+        seconds: of the processor, by method.
+        random_error: relative ones at random states of the box, by method.
+    """
 
     states: Floats
     inside: NDArray[np.bool_]
     of: dict[str, Floats] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    random_error: dict[str, Floats] = field(default_factory=dict)
 
     @property
     def exact(self) -> Floats:
@@ -118,9 +130,13 @@ def network(query: Query, name: str, seed: int, settings: dict[str, Any]) -> Net
 
 
 def compare(
-    chosen: Slice, query: Query, seed: int, settings: dict[str, Any] | None = None
+    chosen: Slice,
+    query: Query,
+    seed: int,
+    settings: dict[str, Any] | None = None,
+    random: int = RANDOM,
 ) -> Values:
-    """V by every method on a slice."""
+    """V by every method on a slice, and by two at so many `random` states of the network's box."""
     states = slice_states(chosen, query)
     offsets = np.abs(query.system.difference(states, query.reference))
     reach = np.array(get_family(chosen.family).reach)
@@ -142,25 +158,50 @@ def compare(
         found = solved.value(states)
         timed(method, begun, np.where(np.isfinite(found), found, np.nan))
         loops = [linear, learned, solved]
-    begun, motions = time.thread_time(), []
+    begun = time.thread_time()
+    motions = _collocated(query, states)
+    timed("collocation", begun, _costs(motions))
+    begun = time.thread_time()
+    timed("PMP", begun, _shot(query, states, loops, motions))
+    rng = np.random.default_rng([seed, 7])
+    drawn = query.reference + rng.uniform(-1, 1, (random, len(reach))) * reach
+    motions = _collocated(query, drawn)
+    exact = np.fmin(_costs(motions), _shot(query, drawn, [linear, learned], motions))
+    for method, value in (("linear regulator", linear), ("network", learned)):
+        values.random_error[method] = (value.value(drawn) / exact - 1)[np.isfinite(exact)]
+    return values
+
+
+def _collocated(query: Query, states: Floats) -> list[Trajectory | None]:
+    """Collocation's motion from each of `[k, n]`; `None` where it fails."""
+    motions: list[Trajectory | None] = []
     for k, state in enumerate(states):
         try:
             motions.append(solve_regulation(query, query.system.wrap(state)))
         except SolveError as error:
-            notes.print(f"{chosen.family}: collocation from {state}: {error}", highlight=False)
+            notes.print(f"{query.system.name}: collocation from {state}: {error}", highlight=False)
             motions.append(None)
         if k % 20 == 0:
-            notes.print(f"{chosen.family}: state {k} of {len(states)}", highlight=False)
-    timed("collocation", begun, np.array([np.nan if m is None else m.cost for m in motions]))
-    begun, costs = time.thread_time(), np.full(len(states), np.nan)
+            notes.print(f"{query.system.name}: state {k} of {len(states)}", highlight=False)
+    return motions
+
+
+def _costs(motions: Sequence[Trajectory | None]) -> Floats:
+    return np.array([np.nan if m is None else m.cost for m in motions])
+
+
+def _shot(
+    query: Query, states: Floats, loops: Sequence[Value], motions: Sequence[Trajectory | None]
+) -> Floats:
+    """The least cost `[k]` by shooting from closed loops and from other methods' motions."""
+    costs = np.full(len(states), np.nan)
     for value in loops:
         found = exact_trajectories(query, [value], states, continuation=False)
         costs = np.fmin(costs, [np.nan if o is None else o.cost for o in found])
     for i, motion in enumerate(motions):
         rival = None if motion is None else exact_from(query, motion)
         costs[i] = np.fmin(costs[i], np.nan if rival is None else rival.cost)
-    timed("PMP", begun, costs)
-    return values
+    return costs
 
 
 def slice_states(chosen: Slice, query: Query) -> Floats:
@@ -189,14 +230,9 @@ def figures_of(values: Values) -> dict[str, Any]:
         error = np.abs(values.error(method))
         row: dict[str, Any] = {"seconds": values.seconds.get(method)}
         for name, some in (("box", values.inside), ("slice", np.ones(len(error), dtype=bool))):
-            known = error[some][np.isfinite(error[some])]
-            row[name] = {
-                "states": int(some.sum()),
-                "answered": len(known),
-                "median": float(np.median(known)) if len(known) else None,
-                "error_95": float(np.quantile(known, 0.95)) if len(known) else None,
-                "largest": float(known.max()) if len(known) else None,
-            }
+            row[name] = _summary(error[some])
+        if method in values.random_error:
+            row["random"] = _summary(np.abs(values.random_error[method]))
         figures[method] = row
     both = np.isfinite(values.of["PMP"]) & np.isfinite(values.of["collocation"])
     gap = np.abs(values.of["PMP"] / values.of["collocation"] - 1)[both]
@@ -206,6 +242,17 @@ def figures_of(values: Values) -> dict[str, Any]:
         "median": float(np.median(gap)),
     }
     return figures
+
+
+def _summary(error: Floats) -> dict[str, Any]:
+    known = error[np.isfinite(error)]
+    return {
+        "states": len(error),
+        "answered": len(known),
+        "median": float(np.median(known)) if len(known) else None,
+        "error_95": float(np.quantile(known, 0.95)) if len(known) else None,
+        "largest": float(known.max()) if len(known) else None,
+    }
 
 
 def _table(name: str, figures: dict[str, Any]) -> Table:
@@ -234,6 +281,13 @@ def _table(name: str, figures: dict[str, Any]) -> Table:
         f"PMP and collocation: within 1e-4 of each other in {100 * both['within_1e-4']:.0f} % "
         f"of {both['both']}, median {both['median']:.0e}"
     )
+    for method in METHODS:
+        if "random" in figures.get(method, {}):
+            row = figures[method]["random"]
+            table.caption += (
+                f"\n{method}, {row['answered']} random states of the box: median "
+                f"{row['median']:.1e}, 95 % {row['error_95']:.1e}, largest {row['largest']:.1e}"
+            )
     return table
 
 

@@ -19,7 +19,7 @@ BRIEF = {
 @pytest.fixture(scope="module")
 def values() -> bench.Values:
     query = Query.load(bench.Path(bench.__file__).parent.parent / "queries" / "pendulum.toml")
-    return bench.compare(SMALL_SLICE, query, 0, BRIEF)
+    return bench.compare(SMALL_SLICE, query, 0, BRIEF, random=6)
 
 
 def test_shooting_and_collocation_agree(values) -> None:
@@ -33,6 +33,14 @@ def test_the_grid_lies_above_by_an_error_that_falls_with_the_cell(values) -> Non
     coarse, fine = (values.error(name) for name in ("grid", "finer grid"))
     assert np.nanmedian(fine) > 0
     assert np.nanmedian(fine) < 0.7 * np.nanmedian(coarse)
+
+
+def test_random_states_of_the_box_are_judged_too(values) -> None:
+    """x'Px is right to second order: off in the box, by less than the box's size would allow."""
+    row = bench.figures_of(values)["linear regulator"]["random"]
+    assert row["answered"] == 6
+    assert 1e-5 < row["median"] < 0.05
+    assert bench.figures_of(values)["network"]["random"]["median"] < 0.1
 
 
 @pytest.mark.slow
