@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from planners.rrtx import RRTX, Update
+from planners.rrtx import RRTX
 from planners.solids import Solid
+from planners.update import Update
 from planners.world import SceneWorld
 from sims.benchmarks import Report
 from sims.benchmarks.rrtx_maps import HALF, PLANE, Map, random_solid, space_100
