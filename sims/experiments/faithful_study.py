@@ -250,6 +250,8 @@ CHANGES: dict[str, dict[str, dict[str, Any]]] = {
     "first order": {"meta": {"second_order": False}},
     "no inner step": {"meta": {"inner_steps": 0}},
     "Adam in the adaptation": {"adaptation": {"optimizer": Optimizer.ADAM, "rate": 1e-3}},
+    "adaptation rate 0.003": {"adaptation": {"rate": 3e-3}},
+    "adaptation rate 0.005": {"adaptation": {"rate": 5e-3}},
     "one adaptation step": {"adaptation": {"steps": 1}},
     # The step that meta-training takes on its sum of 256 samples, whatever the number of samples.
     "one step as meta-trained": {
