@@ -19,6 +19,8 @@ PRINTED = PRETRAINED / "faithful.safetensors"
 """theta_meta of configs/section-iv-b.toml."""
 REPAIRED = PRETRAINED / "repaired.safetensors"
 """theta_meta of configs/repaired.toml."""
+ANYTIME = PRETRAINED / "anytime.safetensors"
+"""theta_meta of configs/anytime.toml."""
 
 
 @dataclass(frozen=True)

@@ -6,17 +6,17 @@ from pathlib import Path
 from rich.console import Console
 
 from learning.faithful.meta import MetaWeights
-from learning.faithful.planner import PRINTED, REPAIRED
+from learning.faithful.planner import ANYTIME, PRINTED, REPAIRED
 from sims.benchmarks import Report
 from sims.experiments.faithful_study import COUNTS, Row, evaluate, fresh_trials, table_of
 
 QUERIES, STARTS = 20, 10
-SHIPPED = {"as printed": PRINTED, "repaired": REPAIRED}
+SHIPPED = {"as printed": PRINTED, "repaired": REPAIRED, "any-time": ANYTIME}
 notes = Console(stderr=True)
 
 
 def run(seed: int, out: Path | None) -> Report:
-    """Both shipped weights on the same fresh queries."""
+    """All shipped weights on the same fresh queries."""
     report = Report()
     with notes.status("exact optima, and the trajectories of the adaptation"):
         trials = fresh_trials(seed, QUERIES, STARTS, max(COUNTS))
@@ -44,7 +44,7 @@ def _figure(curves: dict[str, list[Row]], out: Path) -> None:
     from sims.pictures.plan_figure import save
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.0), layout="constrained")
-    for (name, rows), marker in zip(curves.items(), "os", strict=True):
+    for (name, rows), marker in zip(curves.items(), "os^", strict=True):
         counts = [row.trajectories for row in rows]
         left.plot(counts, [100 * row.paper.reached for row in rows], marker, ls="-", label=name)
         errors = [100 * row.value_error if row.value_error is not None else None for row in rows]

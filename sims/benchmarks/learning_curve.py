@@ -13,7 +13,7 @@ from typing import Any
 from rich.table import Table
 
 from learning.faithful.meta import MetaWeights
-from learning.faithful.planner import PRINTED, REPAIRED, FaithfulPlanner
+from learning.faithful.planner import ANYTIME, PRINTED, REPAIRED, FaithfulPlanner
 from learning.meta_planner import MetaPlanner
 from ocp.planning import deadline, iterations, never
 from ocp.trajectory import SolveError
@@ -37,6 +37,7 @@ BUDGETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 NODES = (1_000, 2_000, 4_500, 9_000, 18_000, 36_000, 60_000, 120_000, 240_000, 480_000)
 ADAPTATIONS = (0, 1, 4, 16)  # trajectories of Algorithm 2
 QUERIES, STARTS = 20, 4
+FAITHFUL = {"printed": PRINTED, "repaired": REPAIRED, "any-time": ANYTIME}
 STYLES = {
     "adapt": ("o", "#0072B2"),
     "adapt without grids": ("^", "#56B4E9"),
@@ -45,6 +46,7 @@ STYLES = {
     "interpolation": ("v", "#E69F00"),
     "meta learning, printed": ("x", "#CC79A7"),
     "meta learning, repaired": ("D", "#882255"),
+    "meta learning, any-time": ("*", "#332288"),
 }
 
 
@@ -115,7 +117,7 @@ def _points(name: str) -> list[Point]:
         method = METHODS[label]
         solver = partial(planned, method.planner(), never())
         points.append(Point(label, 0, solver, queries, method.period))
-    for label, weights in (("printed", PRINTED), ("repaired", REPAIRED)):
+    for label, weights in FAITHFUL.items():
         planner = FaithfulPlanner(MetaWeights.load(weights))
         points += [
             Point(f"meta learning, {label}", n, partial(planned, planner, iterations(n)))
