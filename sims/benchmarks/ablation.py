@@ -38,11 +38,11 @@ QUERIES, STARTS = 40, 4
 
 
 def run(seed: int, out: Path | None, queries: int = QUERIES, starts: int = STARTS) -> Report:
-    """A table for each family; with `out` each query is kept as it is finished."""
+    """A table for both families; with `out` each query is kept as it is finished."""
     report = Report()
     parts = kept("ablation", seed, out)
-    for name, family in families().items():
-        methods = variants("paper" if name == "paper" else "general")
+    for name in ("paper", "general"):
+        family, methods = families()[name], variants(name)
         scores = {method: Score() for method in methods}
         warm: set[str] = set()
         for k in range(queries):
