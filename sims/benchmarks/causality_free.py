@@ -280,8 +280,8 @@ def _map(family: RegulationFamily, seed: int, out: Path) -> None:
     offsets = np.zeros((MAP_NODES**2, system.n))
     for i, column in zip(across, np.meshgrid(*axes_, indexing="ij"), strict=True):
         offsets[:, i] = column.ravel()
-    states = query.reference + offsets
-    states = states[np.abs(offsets).max(axis=1) > 0]
+    away = np.abs(offsets).max(axis=1) > 1e-6  # in the goal itself there is nothing to divide by
+    states = query.reference + offsets[away]
     exact = _optima(query, (linear, value), states)
     place = list(system.position)
     figure, panels = plt.subplots(1, 2, figsize=(9.6, 4.0), layout="constrained", sharey=True)
@@ -290,9 +290,11 @@ def _map(family: RegulationFamily, seed: int, out: Path) -> None:
         panels, (linear, value), ("linear regulator", "network"), strict=True
     ):
         error = np.zeros(MAP_NODES**2)
-        error[np.abs(offsets).max(axis=1) > 0] = 100 * (rival.value(states) / exact - 1)
+        error[away] = 100 * (rival.value(states) / exact - 1)
         grid = error.reshape(MAP_NODES, MAP_NODES).T
         shown = panel.pcolormesh(*axes_, grid, cmap="RdBu_r", vmin=-20, vmax=20, shading="nearest")
+        if across == tuple(place):
+            panel.set_aspect("equal")
         for o in query.obstacles if across == tuple(place) else ():
             at = np.array(o.center) - query.goal_position
             panel.add_patch(Circle((at[0], at[1]), o.radius, fill=False))
