@@ -105,9 +105,11 @@ class MetaState:
         """
         outside = np.asarray(self.query.goal_distance(self.starts[: self.asked]) > 0)
         costs, known = np.where(outside, answer.costs, 0.0), self._known_costs()
+        finite = outside & np.isfinite(costs)
         failed = [i in self.tried and self.extremals[i] is None for i in range(self.asked)]
-        ratios = np.where(failed, np.inf, known / np.maximum(costs, 1e-12))
-        doubted = outside & np.isfinite(costs) & (ratios > suspicion)
+        ratios = np.zeros(self.asked)
+        ratios[finite] = np.where(failed, np.inf, known)[finite] / costs[finite]
+        doubted = ratios > suspicion
         suspects = [int(i) for i in np.argsort(-ratios, kind="stable") if doubted[i]]
         pending = (
             *(Step(start=i) for i in suspects),

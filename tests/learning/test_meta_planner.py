@@ -8,6 +8,7 @@ import pytest
 
 from learning import MetaPlanner
 from learning.adaptation import schedule
+from learning.adaptation.motions import solved_grid
 from learning.adaptation.schedule import Clock, Step
 from learning.conditioned.pretrained_weights import MOST_BYTES, load_pretrained
 from learning.shipped import PRETRAINED
@@ -167,6 +168,18 @@ def test_a_grid_becomes_the_base_only_if_its_own_loops_are_better(problem):
         assert (refined.nodes > 0) == better
         changed = refined.base_costs != posed.base_costs
         assert changed.all() == better
+
+
+def test_a_grid_whose_loops_do_not_arrive_changes_nothing(problem):
+    name, query, starts, _ = problem
+    planner = MetaPlanner.pretrained(name)
+    state = planner.start(query, starts)
+    answer = replace(solved_grid(query, np.array(starts), 4_500), motions=(None,) * len(starts))
+    for posed in (state, replace(state, loops=(None,) * len(starts))):
+        refined = posed.with_grid(answer, 4_500, planner.suspicion)
+        assert refined.suspects == set()
+        assert refined.base is posed.base
+        assert refined.pending == posed.pending
 
 
 def test_a_start_in_the_goal_needs_nothing(problem):
