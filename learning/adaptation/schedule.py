@@ -46,13 +46,13 @@ class Clock:
         trajectory: seconds of an exact one.
         motion: seconds of a grid's closed loop.
         pace: a grid's time over the usual one.
-        doubted: whether the last time of a trajectory, of a grid was out of all proportion.
+        doubted: of "grid" and "trajectory" those whose last time was out of all proportion.
     """
 
     trajectory: float = 3e-3
     motion: float = 0.4e-3
     pace: float = 1.0
-    doubted: dict[bool, bool] = field(default_factory=lambda: {False: False, True: False})
+    doubted: set[str] = field(default_factory=set)
 
     def expected(self, step: Step, motions: int = 0) -> float:
         """Seconds, with caution; a grid's with so many of its closed loops."""
@@ -67,12 +67,15 @@ class Clock:
         the first step also loads code, and whoever believed that time would never take a step
         before a deadline again, and so never learn better.
         """
-        most, grid = OUTLIER * self.expected(step, motions) / CAUTION, bool(step.nodes)
-        believed, self.doubted[grid] = seconds <= most or self.doubted[grid], seconds > most
-        if not believed:
+        kind = "grid" if step.nodes else "trajectory"
+        most = OUTLIER * self.expected(step, motions) / CAUTION
+        if seconds <= most:
+            self.doubted.discard(kind)
+        elif kind not in self.doubted:
+            self.doubted.add(kind)
             return
         seconds = min(seconds, most)
-        if grid:
+        if step.nodes:
             pace = max(seconds - self.motion * motions, 0.0) / USUAL[step.nodes]
             self.pace += 0.5 * (pace - self.pace)
         else:

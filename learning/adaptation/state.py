@@ -38,7 +38,7 @@ class MetaState:
         extremals: the best exact trajectory from each start, or `None`.
         suspects: starts from which a grid's loop is in a better class of motions than what is
             known, or a better guess than one that led nowhere.
-        tried: starts from which the network's loop has been the guess.
+        tried: starts from which a search was made: the network's loop is no guess any more.
         nodes: of the grid behind `base`; 0 if it is the network's.
         grid: the last grid solved.
         trajectories: exact trajectories used.
@@ -117,7 +117,7 @@ class MetaState:
         )
         state = replace(self, suspects=frozenset(suspects), grid=answer, pending=pending)
         state = state.with_searches()
-        if not self._is_worse_than(costs, nodes):
+        if not self._yields_to(costs, nodes):
             return state
         base = (answer.policy, answer.solution.value)
         return replace(state, base=base, base_costs=costs, nodes=nodes)
@@ -147,7 +147,7 @@ class MetaState:
             ]
         )
 
-    def _is_worse_than(self, costs: Floats, nodes: int) -> bool:
+    def _yields_to(self, costs: Floats, nodes: int) -> bool:
         """Whether a grid of so many `nodes` whose closed loops cost so much should be the base.
 
         Its loops tell, from starts outside the tubes: more of them arrive, or all together they

@@ -25,7 +25,8 @@ class Pretrained:
 
     Attributes:
         weights: of the network.
-        worth_nodes: the network's policy is as good as a grid's of so many nodes (measured).
+        worth_nodes: of a grid whose policy is as good as the network's, interpolated between the
+            grids of `zermelo bench learning`: logarithms of nodes against those of the excess.
         provenance: everything in the TOML file.
     """
 

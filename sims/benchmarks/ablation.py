@@ -20,19 +20,7 @@ from ocp.planning import iterations, never
 from ocp.query import Query
 from ocp.value import Policy
 from sims.benchmarks import Report
-from sims.benchmarks.learning import (
-    Score,
-    Solver,
-    correct_optima,
-    eikonal,
-    families,
-    judged,
-    kept,
-    notes,
-    planned,
-    problem,
-    table_of,
-)
+from sims.benchmarks.learning import Solver, compare, eikonal, kept, planned
 
 QUERIES, STARTS = 40, 4
 
@@ -42,25 +30,8 @@ def run(seed: int, out: Path | None, queries: int = QUERIES, starts: int = START
     report = Report()
     parts = kept("ablation", seed, out)
     for name in ("paper", "general"):
-        family, methods = families()[name], variants(name)
-        scores = {method: Score() for method in methods}
-        warm: set[str] = set()
-        for k in range(queries):
-            records = parts.get(
-                f"{name}-{k}",
-                {"starts": starts, "variants": sorted(methods)},
-                lambda k=k, family=family, methods=methods, warm=warm: judged(
-                    problem(family, seed + 2, k, starts), methods, warm
-                ),
-            )
-            notes.print(f"{name}: query {k + 1} of {queries}", highlight=False)
-            for method, record in records.items():
-                scores[method].extend(record)
-        missed = correct_optima([*scores.values()])
-        figures = {method: score.figures() for method, score in scores.items()}
-        report.figures[name] = {**figures, "optima_missed": missed}
-        title = f"{name}: {queries} queries x {starts} starts; {missed} optima by a loop"
-        report.tables.append(table_of(title, figures))
+        # Seeds after those of `learning` and `learning-curve`.
+        compare(report, parts, name, variants(name), seed + 2, queries, starts)
     return report
 
 

@@ -136,27 +136,48 @@ def run(seed: int, out: Path | None, queries: int = QUERIES, starts: int = START
     """A table for each family."""
     report = Report()
     parts = kept("learning", seed, out)
-    for name, family in families().items():
-        methods = fixed_methods(name)
-        warm: set[str] = set()
-        scores = {method: Score() for method in methods}
-        for k in range(queries):
-            records = parts.get(
-                f"{name}-{k}",
-                {"starts": starts},
-                lambda k=k, family=family, methods=methods, warm=warm: judged(
-                    problem(family, seed, k, starts), methods, warm
-                ),
-            )
-            notes.print(f"{name}: query {k + 1} of {queries}", highlight=False)
-            for method, record in records.items():
-                scores[method].extend(record)
-        missed = correct_optima([*scores.values()])
-        figures = {method: score.figures() for method, score in scores.items()}
-        report.figures[name] = {**figures, "optima_missed": missed}
-        title = f"{name}: {queries} queries x {starts} starts; {missed} optima by a loop"
-        report.tables.append(table_of(title, figures))
+    for name in families():
+        compare(report, parts, name, fixed_methods(name), seed, queries, starts)
     return report
+
+
+def compare(
+    report: Report,
+    parts: Parts,
+    name: str,
+    methods: dict[str, Solver],
+    seed: int,
+    queries: int,
+    starts: int,
+) -> None:
+    """Add a family's figures and table to `report`: every method on the same fresh problems.
+
+    Args:
+        report: where to.
+        parts: where each query is kept as it is finished.
+        name: of the family.
+        methods: by name.
+        seed: of the problems.
+        queries: how many.
+        starts: of each.
+    """
+    family = families()[name]
+    scores = {method: Score() for method in methods}
+    warm: set[str] = set()
+    for k in range(queries):
+        records = parts.get(
+            f"{name}-{k}",
+            {"starts": starts, "methods": sorted(methods)},
+            lambda k=k: _judged(problem(family, seed, k, starts), methods, warm),
+        )
+        notes.print(f"{name}: query {k + 1} of {queries}", highlight=False)
+        for method, record in records.items():
+            scores[method].extend(record)
+    missed = correct_optima([*scores.values()])
+    figures = {method: score.figures() for method, score in scores.items()}
+    report.figures[name] = {**figures, "optima_missed": missed}
+    title = f"{name}: {queries} queries x {starts} starts; {missed} optima by a loop"
+    report.tables.append(_table(title, figures))
 
 
 class Loops(Protocol):
@@ -248,7 +269,7 @@ def eikonal(nodes: int, query: Query, _starts: list[NDArray[np.float64]]) -> tup
     return policy, time.perf_counter() - begun
 
 
-def judged(
+def _judged(
     posed: Problem, methods: dict[str, Solver], warm: set[str]
 ) -> dict[str, dict[str, list[Any]]]:
     """Each method's score on one problem; `warm` are those whose code is loaded already."""
@@ -268,7 +289,7 @@ def shown(figure: float | None, form: str, unit: float = 1.0) -> str:
     return "-" if figure is None else form.format(unit * figure)
 
 
-def table_of(title: str, figures: dict[str, dict[str, float | None]]) -> Table:
+def _table(title: str, figures: dict[str, dict[str, float | None]]) -> Table:
     """Methods' figures for reading."""
     table = Table(title=title)
     columns = ("method", "reached", "aggregate", "median", "95 %", "largest", "new collisions")

@@ -127,8 +127,7 @@ def test_starts_that_a_grid_knows_better_motions_from_come_first(problem, cores)
         for i, (loop, optimum) in enumerate(zip(state.loops, optima, strict=True))
         if loop is not None
     )
-    grid, *rest = sorted(state.pending, key=lambda step: step.nodes == 0)
-    state = planner.refine(replace(state, loops=loops, pending=(grid, *rest)))
+    state = planner.refine(replace(state, loops=loops))
     assert state.suspects == set(dear)
     assert [step.start for step in state.pending[:2]] == [3, 1]
     assert state.loops == loops
@@ -144,9 +143,7 @@ def test_a_search_that_failed_is_made_again_from_the_next_grids_loop(problem):
     name, query, starts, optima = problem
     planner = MetaPlanner.pretrained(name)
     state = planner.start(query, starts)
-    grid, *rest = sorted(state.pending, key=lambda step: step.nodes == 0)
-    assert all(step.nodes == 0 for step in rest)
-    state = planner.refine(replace(state, tried=frozenset({2}), pending=(grid,)))
+    state = planner.refine(replace(state, tried=frozenset({2}), pending=state.pending[:1]))
     assert 2 in state.suspects
     assert state.search(2).loop is None
     while not state.finished:
@@ -160,9 +157,8 @@ def test_a_grid_becomes_the_base_only_if_its_own_loops_are_better(problem):
     name, query, starts, _ = problem
     planner = MetaPlanner.pretrained(name)
     state = planner.start(query, starts)
-    grid, *rest = sorted(state.pending, key=lambda step: step.nodes == 0)
     for factor, better in ((0.5, False), (2.0, True)):
-        posed = replace(state, base_costs=factor * state.base_costs, pending=(grid, *rest))
+        posed = replace(state, base_costs=factor * state.base_costs)
         refined = planner.refine(posed)
         assert (refined.base is not posed.base) == better
         assert (refined.nodes > 0) == better
@@ -221,7 +217,7 @@ def test_a_grid_must_leave_time_for_exact_trajectories(problem):
         assert (state.pending[0].nodes > 0) == first
 
 
-@pytest.mark.parametrize("seconds", [0.02, 0.5])
+@pytest.mark.parametrize("seconds", [0.02, 60.0])
 def test_with_a_deadline_what_is_ready_first_is_used_first(problem, seconds):
     """Whatever the order, all that was begun in time is an exact motion or a grid's base."""
     name, query, starts, optima = problem
@@ -230,7 +226,7 @@ def test_with_a_deadline_what_is_ready_first_is_used_first(problem, seconds):
     planned = planner.plan(query, starts, deadline(seconds))
     assert planned.trajectories <= 4 + 4 * len(schedule.GRIDS)
     assert -1e-4 < aggregate_excess(planned.policy, starts, optima) < 0.05
-    if seconds > 0.1:
+    if seconds > 1.0:  # ample on any machine
         assert planned.trajectories >= 4
         assert aggregate_excess(planned.policy, starts, optima) < 1e-3
 
