@@ -17,8 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from learning.adaptation.ahead import Ahead
 from learning.adaptation.motions import SUSPICION, network_loops, solved_grid
-from learning.adaptation.schedule import COARSE, FEW, READY, Clock, Step, steps
-from learning.adaptation.state import MetaState, unknown
+from learning.adaptation.schedule import (
+    COARSE,
+    FEW,
+    FIRST,
+    READY,
+    Clock,
+    Step,
+    machine_clock,
+    steps,
+)
+from learning.adaptation.state import Base, MetaState, unknown
 from learning.conditioned.compiled_network import NetworkPolicy, NetworkValue
 from learning.conditioned.pretrained_weights import Pretrained, load_pretrained
 from learning.conditioned.query_encoder import QueryEncoder
@@ -61,7 +70,7 @@ class MetaPlanner:
     seconds: float | None = None
     suspicion: float = SUSPICION
     cores: int = field(default_factory=usable_cores)
-    clock: Clock = field(default_factory=Clock)
+    clock: Clock = field(default_factory=machine_clock)
 
     @classmethod
     def pretrained(
@@ -107,9 +116,13 @@ class MetaPlanner:
             raise SolveError(Status.NOT_APPLICABLE, "the network was trained on other queries")
         network = NetworkValue(encoder, chosen.weights)
         rows = np.array(starts, dtype=float).reshape(-1, query.system.n)
-        pending = steps(len(rows), self.grids, self.seconds is not None)
+        first = self._first_grid(len(rows))
+        grids = Ahead(partial(solved_grid, query, rows))
+        if first and self.cores > 1:
+            grids = grids.begun([first], 1)
         loops = network_loops(network, rows, self.cores)
         costs = np.array([np.inf if loop is None else loop.cost for loop in loops])
+        costs = np.where(query.goal_distance(rows) > 0, costs, 0.0)
         state = MetaState(
             query,
             network,
@@ -117,71 +130,78 @@ class MetaPlanner:
             len(rows),
             begun,
             loops,
-            (NetworkPolicy(network), network),
-            np.where(query.goal_distance(rows) > 0, costs, 0.0),
-            chosen.worth_nodes,
-            pending,
+            (Base(NetworkPolicy(network), network, costs, chosen.worth_nodes),),
+            steps(len(rows), first, self.seconds is not None),
             Ahead(unknown),
-            Ahead(partial(solved_grid, query, rows)),
+            grids,
             (None,) * len(rows),
         )
         state = state.with_searches()
-        if self.grids and np.isinf(state.base_costs).any():
-            state = self._grid(state, COARSE)
+        if self.grids and np.isinf(costs).any():
+            state = state.with_grid(solved_grid(query, rows, COARSE), COARSE, self.suspicion)
         return self._ordered(state)
 
     def refine(self, state: MetaState) -> MetaState:
         """One exact trajectory or one grid more."""
         if state.finished:
             return state
+        state = self._look_ahead(state)
         step, *rest = state.pending
-        foreign = step.nodes in state.grids.under_way or state.exact.ready(step.start)
-        begun = time.perf_counter()
-        state = self._look_ahead(replace(state, pending=tuple(rest)), step)
-        state = self._grid(state, step.nodes) if step.nodes else self._exact(state, step.start)
-        if not foreign:
-            self.clock.learn(step, time.perf_counter() - begun, state.asked)
+        state = replace(state, pending=tuple(rest))
+        state = self._grid(state, step) if step.nodes else self._exact(state, step)
         return self._ordered(state)
 
     def policy(self, state: MetaState) -> Policy:
         """Tubes around the exact trajectories, the best policy known elsewhere."""
-        return state.base[0] if state.tubes is None else TubePolicy(state.tubes, state.base[0])
+        base = state.base.policy
+        return base if state.tubes is None else TubePolicy(state.tubes, base)
 
     def value(self, state: MetaState) -> Value:
         """V that belongs to `policy`."""
-        return state.base[1] if state.tubes is None else TubeValue(state.tubes, state.base[1])
+        base = state.base.value
+        return base if state.tubes is None else TubeValue(state.tubes, base)
 
-    def _look_ahead(self, state: MetaState, step: Step) -> MetaState:
-        """Have the other cores begin `step` or what comes after it.
+    def _first_grid(self, asked: int) -> int:
+        """Nodes of the first grid for so many starts asked for; 0 for none."""
+        if not self.grids or self.seconds is None:
+            return FIRST if self.grids else 0
+        return self.clock.first_grid(asked, self.seconds, FEW if self.cores < 2 else 1)
+
+    def _look_ahead(self, state: MetaState) -> MetaState:
+        """Have the other cores begin the next step or what comes after it.
 
         The next grid, if few exact trajectories are left to this core before it; then those.
         """
         if self.cores < 2:
             return state
-        exact = [s.start for s in (step, *state.pending) if not s.nodes]
-        grids, later = state.grids, next((s for s in state.pending if s.nodes), None)
-        if later is not None and len(exact) <= FEW and self._ends_in_time(state, later):
+        grids, later = state.grids, next((s for s in state.pending[1:] if s.nodes), None)
+        few = sum(not s.nodes for s in state.pending) <= FEW
+        if later is not None and few and self._ends_in_time(state, later):
             grids = grids.begun([later.nodes], 1)
-        known = (i for i in exact if i < state.asked and state.is_to_be_sought(i))
-        return replace(state, grids=grids, exact=state.exact.begun(known, self.cores + 1))
+        exact = state.exact.begun(state.sought, self.cores + 1)
+        return replace(state, grids=grids, exact=exact)
 
     def _ends_in_time(self, state: MetaState, step: Step) -> bool:
-        passed = time.perf_counter() - state.begun
-        return passed + self.clock.expected(step, state.asked) <= (self.seconds or np.inf)
+        return self.clock.expected(step, state.asked) <= self._seconds_left(state)
+
+    def _seconds_left(self, state: MetaState) -> float:
+        return state.begun + (self.seconds or np.inf) - time.perf_counter()
 
     def _ordered(self, state: MetaState) -> MetaState:
         """The state with the time that its next step will take.
 
         Under a deadline that is a grid which another core has finished, else the first step that
-        ends in time; a grid must leave time for a few exact trajectories, which buy more.
+        ends in time; no grid is waited for as long as there is something to do here, and one not
+        begun must leave time for a few exact trajectories, which buy more.
         """
         if not state.pending:
             return replace(state, next_seconds=0.0)
         first = state.pending[0]
         if self.seconds is not None:
-            left = state.begun + self.seconds - time.perf_counter()
+            left = self._seconds_left(state)
             ready = (s for s in state.pending if s.nodes and state.grids.ready(s.nodes))
-            timely = (s for s in state.pending if self._fits(state, s, left))
+            here = sorted(state.pending, key=lambda s: s.nodes in state.grids.under_way)
+            timely = (s for s in here if self._fits(state, s, left))
             first = next(ready, None) or next(timely, first)
             others = tuple(s for s in state.pending if s is not first)
             state = replace(state, pending=(first, *others))
@@ -190,7 +210,7 @@ class MetaPlanner:
     def _fits(self, state: MetaState, step: Step, left: float) -> bool:
         """Whether a step ends in so many seconds; a grid together with a few exact trajectories."""
         seconds = self._left(state, step)
-        if step.nodes:
+        if step.nodes and step.nodes not in state.grids.under_way:
             exact = [s for s in state.pending if not s.nodes][:FEW]
             seconds += sum(self.clock.expected(s) for s in exact) / self.cores
         return seconds <= left
@@ -199,20 +219,30 @@ class MetaPlanner:
         """Seconds until the step is done, if it is taken now."""
         if state.grids.ready(step.nodes) or state.exact.ready(step.start):
             return READY
-        expected = self.clock.expected(step, state.asked)
         if step.nodes in state.grids.under_way:
             passed = time.perf_counter() - state.grids.since[step.nodes]
-            return max(READY, expected - passed)
-        return expected
+            return max(READY, self.clock.likely(step, state.asked) - passed)
+        return self.clock.expected(step, state.asked)
 
-    def _grid(self, state: MetaState, nodes: int) -> MetaState:
-        """Solve a grid."""
+    def _grid(self, state: MetaState, step: Step) -> MetaState:
+        """Take a grid; while another core solves it, exact trajectories are found here.
+
+        Under a deadline these are steps of their own, and a grid that is late is left out.
+        """
+        nodes = step.nodes
+        if nodes in state.grids.under_way:
+            if self.seconds is None:
+                exact = state.exact.computed(state.sought, lambda: state.grids.ready(nodes))
+                state = replace(state, exact=exact)
+            elif not state.grids.awaited(nodes, self._seconds_left(state)):
+                return state
         answer, grids = state.grids.taken(nodes)
+        self.clock.learn(step, answer.seconds, state.asked)
         return replace(state, grids=grids).with_grid(answer, nodes, self.suspicion)
 
-    def _exact(self, state: MetaState, i: int) -> MetaState:
-        """The exact trajectory from the i-th start, kept if it is the cheapest known from there."""
-        query = state.query
+    def _exact(self, state: MetaState, step: Step) -> MetaState:
+        """The exact trajectory from a start, kept if it is the cheapest known from there."""
+        query, i = state.query, step.start
         if i >= len(state.starts):
             own = sample_start(query, np.random.default_rng([i, len(state.query.obstacles)]))
             state = replace(
@@ -223,7 +253,12 @@ class MetaPlanner:
             )
         if query.goal_distance(state.starts[i]) <= 0 or not state.is_to_be_sought(i):
             return state
+        foreign, begun = state.exact.ready(i), time.perf_counter()
         if i >= state.asked:
-            return state.with_found(i, state.search(i).found())
-        found, exact = state.exact.taken(i)
-        return replace(state, exact=exact).with_found(i, found)
+            state = state.with_found(i, state.search(i).found())
+        else:
+            found, exact = state.exact.taken(i)
+            state = replace(state, exact=exact).with_found(i, found)
+        if not foreign:
+            self.clock.learn(step, time.perf_counter() - begun)
+        return state

@@ -20,6 +20,8 @@ from ocp.value import Policy, Value
 
 log = logging.getLogger(__name__)
 
+DOUBT = 2.0  # a step may take so many times as long as expected
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -206,9 +208,8 @@ def plan(
     until = until or iterations(8)
     begun = time.perf_counter()
     work = _Refinement(planner, until, begun, planner.start(query, checked))
-    if until.seconds == math.inf:
-        work.run()
-    elif in_time(work.run, begun + until.seconds - time.perf_counter()) is None:
+    work.run(late=False)
+    if not work.is_over and in_time(work.run, begun + until.seconds - time.perf_counter()) is None:
         work.given_up = True
         log.info("refinement %d is late and left out", work.done + 1)
     state = work.state
@@ -218,7 +219,10 @@ def plan(
 
 @dataclass
 class _Refinement:
-    """The loop of `plan`: on a thread of its own under a deadline, one for all its steps.
+    """The loop of `plan`: on the caller's thread, but for steps that may end after a deadline.
+
+    These are left to one thread beside, which the caller can give up waiting for. It is not used
+    for all: a thread just woken is often put on the core that already works for the planner.
 
     Attributes:
         state: the best so far.
@@ -233,14 +237,25 @@ class _Refinement:
     done: int = 0
     given_up: bool = False
 
-    def run(self) -> bool:
-        """Refine until the rule holds or nothing more is to be gained; true at the end."""
-        while not (self.given_up or self.state.finished or self._is_enough()):
+    @property
+    def is_over(self) -> bool:
+        """Whether the rule holds or nothing more is to be gained."""
+        return self.given_up or self.state.finished or self._is_enough()
+
+    def run(self, late: bool = True) -> bool:
+        """Refine until it is over or, unless steps may be `late`, one may be; true at the end."""
+        while not self.is_over and (late or not self._may_be_late()):
             better = self.planner.refine(self.state)
             if not self.given_up:
                 self.state = better
                 self.done += 1
         return True
+
+    def _may_be_late(self) -> bool:
+        if self.until.seconds == math.inf:
+            return False
+        left = self.begun + self.until.seconds - time.perf_counter()
+        return self.state.next_seconds == 0 or left < DOUBT * self.state.next_seconds
 
     def _is_enough(self) -> bool:
         seconds = time.perf_counter() - self.begun + self.state.next_seconds

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
@@ -29,6 +29,10 @@ class Ahead(Generic[Answer]):
         """Whether the task's answer is there already."""
         return task in self.under_way and self.under_way[task].done()
 
+    def awaited(self, task: int, seconds: float) -> bool:
+        """Whether the answer of a task under way is there within so many seconds."""
+        return bool(wait([self.under_way[task]], max(0.0, seconds)).done)
+
     def begun(self, tasks: Iterable[int], most: int) -> "Ahead[Answer]":
         """With further tasks, in their order, handed to other cores while at most `most` wait."""
         under_way, since = dict(self.under_way), dict(self.since)
@@ -47,6 +51,21 @@ class Ahead(Generic[Answer]):
             self.under_way[task].cancel()
         left = {i: f for i, f in self.under_way.items() if i not in dropped}
         return replace(self, under_way=left)
+
+    def computed(self, tasks: Iterable[int], enough: Callable[[], bool]) -> "Ahead[Answer]":
+        """With those of the tasks that this core gets done before there is `enough`.
+
+        Tasks that another core has begun are passed over.
+        """
+        under_way = dict(self.under_way)
+        for task in tasks:
+            if enough():
+                break
+            mine = under_way.get(task)
+            if mine is None or mine.cancel():
+                under_way[task] = Future()
+                under_way[task].set_result(self.work(task))
+        return replace(self, under_way=under_way)
 
     def taken(self, task: int) -> "tuple[Answer, Ahead[Answer]]":
         """A task's answer, and the others.

@@ -1,5 +1,6 @@
 """Motions from the starts: closed loops of the network and of grids, and the exact ones beside."""
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,11 +78,13 @@ class GridAnswer:
         solution: the value.
         policy: its policy.
         motions: from each start; `None` where one does not get to the goal.
+        seconds: that all this took.
     """
 
     solution: EikonalSolution
     policy: LookaheadPolicy
     motions: tuple[Trajectory | None, ...]
+    seconds: float
 
     @property
     def costs(self) -> Floats:
@@ -91,9 +94,11 @@ class GridAnswer:
 
 def solved_grid(query: Query, starts: Floats, nodes: int) -> GridAnswer:
     """A grid of about so many nodes and its closed loops from `[k, n]`."""
+    begun = time.perf_counter()
     solution = solve_eikonal(query, Grid.for_query(query, nodes, MARGIN))
     policy = solution.policy()
-    return GridAnswer(solution, policy, tuple(rollouts(query, policy, starts)))
+    motions = tuple(rollouts(query, policy, starts))
+    return GridAnswer(solution, policy, motions, time.perf_counter() - begun)
 
 
 @dataclass(frozen=True)

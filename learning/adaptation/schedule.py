@@ -1,11 +1,12 @@
 """The refinements of a plan: which there are, in which order, and how long each takes."""
 
 from dataclasses import dataclass, field
-from itertools import chain
+from functools import cache
 
-USUAL = {4_500: 3e-3, 18_000: 8e-3, 60_000: 28e-3, 240_000: 125e-3}
+USUAL = {4_500: 3e-3, 9_000: 4.7e-3, 18_000: 8e-3, 60_000: 28e-3, 240_000: 125e-3}
 """Nodes, and the seconds that one solve usually takes: only ratios matter."""
-COARSE, *GRIDS = USUAL  # the coarse one answers where the network's check fails
+COARSE = 4_500  # answers where the network's check fails
+FIRST = 18_000  # begun together with the network, unless a deadline has it otherwise
 TRAJECTORIES = 8  # exact ones, from states of the planner's choice if no starts are asked for
 FEW = 4  # exact trajectories left to one core while another solves the next grid
 CAUTION = 1.2  # by how much a step's expected time is overestimated
@@ -21,21 +22,23 @@ class Step:
     nodes: int = 0
 
 
-def steps(asked: int, grids: bool, patient: bool) -> tuple[Step, ...]:
+def steps(asked: int, first: int, patient: bool) -> tuple[Step, ...]:
     """What there is to do for so many starts asked for.
 
     A grid comes first: it tells from which starts the network's loop is in a wrong class.
 
     Args:
         asked: starts; without any, the planner chooses its own.
-        grids: whether grids are allowed.
+        first: nodes of the first grid; 0 for no grids at all.
         patient: whether finer grids follow exact trajectories that leave them little to gain.
     """
-    coarse, *finer = ([Step(nodes=n)] for n in GRIDS) if grids else ([],)
     exact = [Step(start=i) for i in range(asked or TRAJECTORIES)]
+    if not first:
+        return tuple(exact)
+    finer = (n for n in USUAL if n > max(first, FIRST))
     if asked and asked <= TRAJECTORIES and not patient:
-        finer = []
-    return (*coarse, *exact, *chain(*finer))
+        finer = ()
+    return (Step(nodes=first), *exact, *(Step(nodes=n) for n in finer))
 
 
 @dataclass
@@ -54,11 +57,24 @@ class Clock:
     pace: float = 1.0
     doubted: set[str] = field(default_factory=set)
 
-    def expected(self, step: Step, motions: int = 0) -> float:
-        """Seconds, with caution; a grid's with so many of its closed loops."""
+    def likely(self, step: Step, motions: int = 0) -> float:
+        """Seconds; a grid's with so many of its closed loops."""
         if step.nodes:
-            return CAUTION * (self.pace * USUAL[step.nodes] + self.motion * motions)
-        return CAUTION * self.trajectory
+            return self.pace * USUAL[step.nodes] + self.motion * motions
+        return self.trajectory
+
+    def expected(self, step: Step, motions: int = 0) -> float:
+        """Seconds, with caution."""
+        return CAUTION * self.likely(step, motions)
+
+    def first_grid(self, asked: int, seconds: float, exact: int) -> int:
+        """Nodes of the finest grid, up to `FIRST`, for so many starts that ends in `seconds`.
+
+        With `exact` trajectories after it; 0 if none does.
+        """
+        left = seconds - exact * self.trajectory
+        timely = (n for n in USUAL if n <= FIRST and self.likely(Step(nodes=n), asked) <= left)
+        return max(timely, default=0)
 
     def learn(self, step: Step, seconds: float, motions: int = 0) -> None:
         """Take note of a step's time.
@@ -68,7 +84,7 @@ class Clock:
         before a deadline again, and so never learn better.
         """
         kind = "grid" if step.nodes else "trajectory"
-        most = OUTLIER * self.expected(step, motions) / CAUTION
+        most = OUTLIER * self.likely(step, motions)
         if seconds <= most:
             self.doubted.discard(kind)
         elif kind not in self.doubted:
@@ -80,3 +96,11 @@ class Clock:
             self.pace += 0.5 * (pace - self.pace)
         else:
             self.trajectory += 0.3 * (seconds - self.trajectory)
+            # A pace that was too slow for any grid is not seen again: it is forgotten in time.
+            self.pace += 0.02 * (1.0 - self.pace)
+
+
+@cache
+def machine_clock() -> Clock:
+    """What all plans of this process have learned of the machine."""
+    return Clock()

@@ -1,7 +1,7 @@
 """What is known of a query, and how a grid or an exact trajectory is taken into it."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,37 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Base:
+    """What steers off the tubes: the network, or a grid.
+
+    Attributes:
+        policy: its policy.
+        value: its value.
+        costs: `[asked]`, of its closed loops; infinite where one does not arrive.
+        nodes: of the grid; for a network, of a grid as good as it.
+    """
+
+    policy: Policy
+    value: Value
+    costs: Floats
+    nodes: int
+
+    def yields_to(self, other: "Base", free: list[int]) -> bool:
+        """Whether another should be the base, where the starts outside the tubes are `free`.
+
+        The closed loops from these tell: more of them arrive, or all together they cost less. If
+        there are none, the size tells.
+        """
+        if not free:
+            return other.nodes > self.nodes
+        ours, theirs = self.costs[free], other.costs[free]
+        lost, kept = np.isinf(theirs).sum(), np.isinf(ours).sum()
+        if lost != kept:
+            return bool(lost < kept)
+        return bool(theirs[np.isfinite(theirs)].sum() < ours[np.isfinite(ours)].sum())
+
+
+@dataclass(frozen=True)
 class MetaState:
     """What is known of a query so far; see `ocp.planning.PlannerState`.
 
@@ -29,9 +60,7 @@ class MetaState:
         asked: how many were asked for.
         begun: when, seconds of `time.perf_counter`.
         loops: the network's closed loop from each start; `None` if it does not get to the goal.
-        base: policy and value off the tubes.
-        base_costs: `[asked]`, of the closed loops of `base`; infinite where one does not arrive.
-        worth_nodes: of a grid as good as the network.
+        bases: the network and all grids solved, any of which may steer off the tubes.
         pending: steps to come.
         exact: exact trajectories under way on other cores.
         grids: grids under way on other cores.
@@ -39,7 +68,6 @@ class MetaState:
         suspects: starts from which a grid's loop is in a better class of motions than what is
             known, or a better guess than one that led nowhere.
         tried: starts from which a search was made: the network's loop is no guess any more.
-        nodes: of the grid behind `base`; 0 if it is the network's.
         grid: the last grid solved.
         trajectories: exact trajectories used.
         next_seconds: expected for the next step.
@@ -51,16 +79,13 @@ class MetaState:
     asked: int
     begun: float
     loops: tuple[Loop | None, ...]
-    base: tuple[Policy, Value]
-    base_costs: Floats
-    worth_nodes: int
+    bases: tuple[Base, ...]
     pending: tuple[Step, ...]
     exact: Ahead[list[Extremal]]
     grids: Ahead[GridAnswer]
     extremals: tuple[Extremal | None, ...]
     suspects: frozenset[int] = frozenset()
     tried: frozenset[int] = frozenset()
-    nodes: int = 0
     grid: GridAnswer | None = None
     trajectories: int = 0
     next_seconds: float = 0.0
@@ -68,6 +93,12 @@ class MetaState:
     @property
     def finished(self) -> bool:
         return not self.pending
+
+    @cached_property
+    def base(self) -> Base:
+        """The best of those known, for the starts outside the tubes."""
+        free = [i for i in range(self.asked) if self.extremals[i] is None]
+        return reduce(lambda best, b: b if best.yields_to(b, free) else best, self.bases)
 
     @cached_property
     def tubes(self) -> Tubes | None:
@@ -87,6 +118,12 @@ class MetaState:
         search = self.search(i)
         fresh = search.loop is not None and search.known is None
         return fresh or search.motion is not None
+
+    @property
+    def sought(self) -> list[int]:
+        """The starts asked for whose searches are pending, in their order."""
+        pending = (s.start for s in self.pending if not s.nodes and s.start < self.asked)
+        return [i for i in pending if self.is_to_be_sought(i)]
 
     def with_searches(self) -> "MetaState":
         """With the searches from the starts asked for, with all that is known now.
@@ -115,12 +152,15 @@ class MetaState:
             *(Step(start=i) for i in suspects),
             *(step for step in self.pending if step.start not in suspects),
         )
-        state = replace(self, suspects=frozenset(suspects), grid=answer, pending=pending)
-        state = state.with_searches()
-        if not self._yields_to(costs, nodes):
-            return state
-        base = (answer.policy, answer.solution.value)
-        return replace(state, base=base, base_costs=costs, nodes=nodes)
+        base = Base(answer.policy, answer.solution.value, costs, nodes)
+        state = replace(
+            self,
+            suspects=frozenset(suspects),
+            grid=answer,
+            bases=(*self.bases, base),
+            pending=pending,
+        )
+        return state.with_searches()
 
     def with_found(self, i: int, found: list[Extremal]) -> "MetaState":
         """With what a search from the i-th start has found; the cheapest counts."""
@@ -146,21 +186,6 @@ class MetaState:
                 for loop, extremal in zip(self.loops[asked], self.extremals[asked], strict=True)
             ]
         )
-
-    def _yields_to(self, costs: Floats, nodes: int) -> bool:
-        """Whether a grid of so many `nodes` whose closed loops cost so much should be the base.
-
-        Its loops tell, from starts outside the tubes: more of them arrive, or all together they
-        cost less. Where there are no such starts its size tells.
-        """
-        free = [i for i in range(self.asked) if self.extremals[i] is None]
-        if not free:
-            return nodes > max(self.nodes, self.worth_nodes)
-        ours, theirs = self.base_costs[free], costs[free]
-        lost, kept = np.isinf(theirs).sum(), np.isinf(ours).sum()
-        if lost != kept:
-            return bool(lost < kept)
-        return bool(theirs[np.isfinite(theirs)].sum() < ours[np.isfinite(ours)].sum())
 
 
 def unknown(i: int) -> list[Extremal]:

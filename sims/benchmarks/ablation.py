@@ -61,7 +61,7 @@ def without_tubes(
     state = planner.start(query, starts)
     while not state.finished:
         state = planner.refine(state)
-    return state.base[0], time.perf_counter() - begun
+    return state.base.policy, time.perf_counter() - begun
 
 
 def beside_grid(
