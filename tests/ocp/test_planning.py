@@ -87,6 +87,22 @@ def test_a_refinement_that_is_late_is_not_waited_for() -> None:
     assert result.policy == 2
 
 
+def test_only_steps_that_may_be_late_are_taken_on_another_thread() -> None:
+    here, threads = threading.get_ident(), []
+
+    class Told(Counter):
+        def refine(self, state):
+            threads.append(threading.get_ident())
+            return super().refine(state)
+
+    for next_seconds, same in ((1.0, True), (40.0, False), (0.0, False)):
+        threads.clear()
+        first = State(next_seconds=next_seconds, last=3)
+        plan(Told(first), QUERY, [np.array([1.0])], deadline(60.0))
+        assert len(threads) == 3
+        assert [t == here for t in threads] == [same] * 3
+
+
 def test_an_error_of_a_refinement_is_the_caller_s_also_before_a_deadline() -> None:
     class Failing(Counter):
         def refine(self, state):  # noqa: ARG002

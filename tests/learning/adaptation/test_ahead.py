@@ -68,3 +68,24 @@ def test_while_others_are_busy_a_later_task_is_computed_here() -> None:
 def test_unwanted_tasks_are_forgotten() -> None:
     ahead = Ahead(square).begun([1, 2, 3], 3).without([2, 7])
     assert set(ahead.under_way) == {1, 3}
+
+
+def test_while_something_is_awaited_tasks_are_computed_here_once() -> None:
+    counts: dict[int, int] = {}
+
+    def work(k: int) -> int:
+        counts[k] = counts.get(k, 0) + 1
+        return k
+
+    ahead = Ahead(work).computed(range(9), lambda: len(counts) >= 4)
+    assert all(ahead.ready(k) for k in range(4))
+    assert [ahead.taken(k)[0] for k in range(9)] == list(range(9))
+    assert set(counts.values()) == {1}
+
+
+def test_what_is_late_is_not_awaited_longer_than_told() -> None:
+    released = threading.Event()
+    ahead = Ahead(lambda _: released.wait(60)).begun([3], 1)
+    assert not ahead.awaited(3, 0.05)
+    released.set()
+    assert ahead.awaited(3, 60.0)
