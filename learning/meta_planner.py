@@ -165,7 +165,7 @@ class MetaPlanner:
         """Nodes of the first grid for so many starts asked for; 0 for none."""
         if not self.grids or self.seconds is None:
             return FIRST if self.grids else 0
-        return self.clock.first_grid(asked, self.seconds, FEW if self.cores < 2 else 1)
+        return self.clock.first_grid(asked, self.seconds)
 
     def _look_ahead(self, state: MetaState) -> MetaState:
         """Have the other cores begin the next step or what comes after it.

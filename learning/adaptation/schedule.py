@@ -11,6 +11,7 @@ TRAJECTORIES = 8  # exact ones, from states of the planner's choice if no starts
 FEW = 4  # exact trajectories left to one core while another solves the next grid
 CAUTION = 1.2  # by how much a step's expected time is overestimated
 OUTLIER = 4.0  # a step's time counts for at most so many times what was expected
+GRID_PART = 0.65  # of a deadline for the first grid
 READY = 3e-4  # seconds to take up what another core has finished
 
 
@@ -67,13 +68,13 @@ class Clock:
         """Seconds, with caution."""
         return CAUTION * self.likely(step, motions)
 
-    def first_grid(self, asked: int, seconds: float, exact: int) -> int:
-        """Nodes of the finest grid, up to `FIRST`, for so many starts that ends in `seconds`.
+    def first_grid(self, asked: int, seconds: float) -> int:
+        """Nodes of the finest grid, up to `FIRST`, that ends well before a deadline; 0 for none.
 
-        With `exact` trajectories after it; 0 if none does.
+        What is left of it is for the exact trajectories that the grid asks for.
         """
-        left = seconds - exact * self.trajectory
-        timely = (n for n in USUAL if n <= FIRST and self.likely(Step(nodes=n), asked) <= left)
+        most = GRID_PART * seconds
+        timely = (n for n in USUAL if n <= FIRST and self.likely(Step(nodes=n), asked) <= most)
         return max(timely, default=0)
 
     def learn(self, step: Step, seconds: float, motions: int = 0) -> None:

@@ -94,16 +94,21 @@ class MetaState:
     def finished(self) -> bool:
         return not self.pending
 
+    def is_steered(self, i: int) -> bool:
+        """Whether an exact trajectory leads from the i-th start, and no grid knows a better way."""
+        return self.extremals[i] is not None and i not in self.suspects
+
     @cached_property
     def base(self) -> Base:
         """The best of those known, for the starts outside the tubes."""
-        free = [i for i in range(self.asked) if self.extremals[i] is None]
+        free = [i for i in range(self.asked) if not self.is_steered(i)]
         return reduce(lambda best, b: b if best.yields_to(b, free) else best, self.bases)
 
     @cached_property
     def tubes(self) -> Tubes | None:
         """Around the exact trajectories found, if there are any."""
-        solved = [e for e in self.extremals if e is not None]
+        steered = (i for i in range(len(self.starts)) if self.is_steered(i))
+        solved = [e for i in steered if (e := self.extremals[i]) is not None]
         return Tubes.around(self.query, solved) if solved else None
 
     def search(self, i: int) -> Search:

@@ -251,6 +251,14 @@ CONTESTANTS = (
         note="Algorithms 1 and 2 with the departures of learning/configs/repaired.toml, n = 8",
     ),
     Contestant(
+        "anytime",
+        "Anytime adaptation (any-time settings)",
+        "",
+        _faithful("anytime"),
+        EIGHT,
+        note="Algorithms 1 and 2 with the settings of learning/configs/anytime.toml, n = 8",
+    ),
+    Contestant(
         "adapt",
         "adapt (ours)",
         "adapt",

@@ -16,7 +16,7 @@ from sims.parts import Parts
 
 """In the order of the figure's panels."""
 PREFERRED = ("adapt", "eikonal")
-PAPERS = ("faithful", "repaired")
+PAPERS = ("faithful", "anytime")
 
 
 def run(setting: Setting, parts: Parts) -> Findings:

@@ -156,7 +156,7 @@ CURVES: dict[str, tuple[str, Callable]] = {
     "refmm": ("refmm-fine", _refining("refmm-fine", 16)),
     "set-valued": ("set-valued-coarse", _sizes(_set_valued, CELLS)),
     "faithful": ("faithful", _refining("faithful", 64)),
-    "repaired": ("repaired", _refining("repaired", 64)),
+    "anytime": ("anytime", _refining("anytime", 64)),
     "interpolation": ("interpolation", _refining("interpolation", 0)),
 }
 """The contestant behind each curve, and what traces it."""

@@ -315,16 +315,16 @@ def test_one_slow_step_does_not_end_all_others(step: Step) -> None:
 
 def test_the_first_grid_is_the_finest_that_ends_before_the_deadline() -> None:
     clock = Clock()
-    sizes = [clock.first_grid(4, seconds, exact=1) for seconds in np.linspace(1e-3, 0.1, 50)]
+    sizes = [clock.first_grid(4, seconds) for seconds in np.linspace(1e-3, 0.1, 50)]
     assert sizes == sorted(sizes)
     assert sizes[0] == 0
     assert sizes[-1] == schedule.FIRST
-    assert clock.first_grid(40, 0.02, exact=1) < clock.first_grid(1, 0.02, exact=1)
+    assert clock.first_grid(40, 0.02) < clock.first_grid(1, 0.02)
 
 
 def test_a_pace_too_slow_for_any_grid_is_forgotten_in_time() -> None:
     clock = Clock(pace=30.0)
-    assert clock.first_grid(1, 0.02, exact=1) == 0
+    assert clock.first_grid(1, 0.02) == 0
     for _ in range(400):
         clock.learn(Step(start=0), clock.trajectory)
-    assert clock.first_grid(1, 0.02, exact=1) > 0
+    assert clock.first_grid(1, 0.02) > 0
