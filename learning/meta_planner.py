@@ -146,10 +146,13 @@ class MetaPlanner:
         if state.finished:
             return state
         state = self._look_ahead(state)
-        step, *rest = state.pending
-        state = replace(state, pending=tuple(rest))
-        state = self._grid(state, step) if step.nodes else self._exact(state, step)
-        return self._ordered(state)
+        return self._ordered(self._taken(state, state.pending[0]))
+
+    def settled(self, state: MetaState) -> MetaState:
+        """With the grids and exact trajectories that other cores have finished; see `Settles`."""
+        while ready := [s for s in state.pending if self._is_ready(state, s)]:
+            state = self._taken(state, ready[0])
+        return state
 
     def policy(self, state: MetaState) -> Policy:
         """Tubes around the exact trajectories, the best policy known elsewhere."""
@@ -215,14 +218,23 @@ class MetaPlanner:
             seconds += sum(self.clock.expected(s) for s in exact) / self.cores
         return seconds <= left
 
+    def _is_ready(self, state: MetaState, step: Step) -> bool:
+        """Whether another core has finished the step."""
+        return state.grids.ready(step.nodes) or state.exact.ready(step.start)
+
     def _left(self, state: MetaState, step: Step) -> float:
         """Seconds until the step is done, if it is taken now."""
-        if state.grids.ready(step.nodes) or state.exact.ready(step.start):
+        if self._is_ready(state, step):
             return READY
         if step.nodes in state.grids.under_way:
             passed = time.perf_counter() - state.grids.since[step.nodes]
-            return max(READY, self.clock.likely(step, state.asked) - passed)
+            return max(READY, self.clock.expected(step, state.asked) - passed)
         return self.clock.expected(step, state.asked)
+
+    def _taken(self, state: MetaState, step: Step) -> MetaState:
+        """The state after one of its pending steps."""
+        state = replace(state, pending=tuple(s for s in state.pending if s is not step))
+        return self._grid(state, step) if step.nodes else self._exact(state, step)
 
     def _grid(self, state: MetaState, step: Step) -> MetaState:
         """Take a grid; while another core solves it, exact trajectories are found here.

@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from ocp.value import Policy, Value
 
 log = logging.getLogger(__name__)
 
-DOUBT = 2.0  # a step may take so many times as long as expected
+DOUBT = 2.5  # a step may take so many times as long as expected
 
 
 @dataclass(frozen=True)
@@ -139,6 +139,15 @@ class Planner(Protocol):
         ...
 
 
+@runtime_checkable
+class Settles(Protocol):
+    """A planner that works on several cores, and at a deadline takes up what they have done."""
+
+    def settled(self, state: Any) -> Any:
+        """The state with all that is ready; nothing is computed or waited for."""
+        ...
+
+
 Answer = tuple[Policy, Value]
 
 
@@ -213,6 +222,8 @@ def plan(
         work.given_up = True
         log.info("refinement %d is late and left out", work.done + 1)
     state = work.state
+    if work.given_up and isinstance(planner, Settles):
+        state = planner.settled(state)
     policy, value = planner.policy(state), planner.value(state)
     return Plan(query, policy, value, time.perf_counter() - begun, state.trajectories)
 

@@ -9,9 +9,8 @@ COARSE = 4_500  # answers where the network's check fails
 FIRST = 18_000  # begun together with the network, unless a deadline has it otherwise
 TRAJECTORIES = 8  # exact ones, from states of the planner's choice if no starts are asked for
 FEW = 4  # exact trajectories left to one core while another solves the next grid
-CAUTION = 1.2  # by how much a step's expected time is overestimated
 OUTLIER = 4.0  # a step's time counts for at most so many times what was expected
-GRID_PART = 0.65  # of a deadline for the first grid
+GRID_PART = 0.85  # of a deadline for the first grid
 READY = 3e-4  # seconds to take up what another core has finished
 
 
@@ -58,15 +57,11 @@ class Clock:
     pace: float = 1.0
     doubted: set[str] = field(default_factory=set)
 
-    def likely(self, step: Step, motions: int = 0) -> float:
+    def expected(self, step: Step, motions: int = 0) -> float:
         """Seconds; a grid's with so many of its closed loops."""
         if step.nodes:
             return self.pace * USUAL[step.nodes] + self.motion * motions
         return self.trajectory
-
-    def expected(self, step: Step, motions: int = 0) -> float:
-        """Seconds, with caution."""
-        return CAUTION * self.likely(step, motions)
 
     def first_grid(self, asked: int, seconds: float) -> int:
         """Nodes of the finest grid, up to `FIRST`, that ends well before a deadline; 0 for none.
@@ -74,7 +69,7 @@ class Clock:
         What is left of it is for the exact trajectories that the grid asks for.
         """
         most = GRID_PART * seconds
-        timely = (n for n in USUAL if n <= FIRST and self.likely(Step(nodes=n), asked) <= most)
+        timely = (n for n in USUAL if n <= FIRST and self.expected(Step(nodes=n), asked) <= most)
         return max(timely, default=0)
 
     def learn(self, step: Step, seconds: float, motions: int = 0) -> None:
@@ -85,7 +80,7 @@ class Clock:
         before a deadline again, and so never learn better.
         """
         kind = "grid" if step.nodes else "trajectory"
-        most = OUTLIER * self.likely(step, motions)
+        most = OUTLIER * self.expected(step, motions)
         if seconds <= most:
             self.doubted.discard(kind)
         elif kind not in self.doubted:

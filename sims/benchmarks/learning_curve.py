@@ -33,7 +33,7 @@ from sims.benchmarks.learning import (
 from sims.closed_loop import LoopSettings
 from sims.methods import METHODS
 
-BUDGETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+BUDGETS = (0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 NODES = (1_000, 2_000, 4_500, 9_000, 18_000, 36_000, 60_000, 120_000, 240_000, 480_000)
 ADAPTATIONS = (0, 1, 4, 16)  # trajectories of Algorithm 2
 QUERIES, STARTS = 20, 4

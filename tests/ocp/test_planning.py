@@ -87,6 +87,22 @@ def test_a_refinement_that_is_late_is_not_waited_for() -> None:
     assert result.policy == 2
 
 
+def test_what_is_ready_at_the_deadline_is_taken_up() -> None:
+    answered = threading.Event()
+
+    class Settling(Counter):
+        def refine(self, state):
+            assert answered.wait(60)
+            return super().refine(state)
+
+        def settled(self, state):
+            return replace(state, steps=state.steps + 10)
+
+    result: Any = plan(Settling(State()), QUERY, [np.array([1.0])], deadline(0.1))
+    answered.set()
+    assert result.policy == 10
+
+
 def test_only_steps_that_may_be_late_are_taken_on_another_thread() -> None:
     here, threads = threading.get_ident(), []
 
