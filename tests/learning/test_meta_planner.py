@@ -249,6 +249,8 @@ def test_where_a_grid_knows_a_better_way_no_tube_steers(problem):
         state = planner.refine(state)
     doubted = replace(state, suspects=frozenset({1}))
     assert [i for i in range(4) if doubted.is_steered(i)] == [0, 2, 3]
+    assert state.tubes is not None
+    assert doubted.tubes is not None
     assert len(doubted.tubes.points) < len(state.tubes.points)
     assert doubted.base is min(doubted.bases, key=lambda base: base.costs[1])
 
