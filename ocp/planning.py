@@ -21,6 +21,7 @@ from ocp.value import Policy, Value
 log = logging.getLogger(__name__)
 
 DOUBT = 2.5  # a step may take so many times as long as expected
+HAND_OVER = 1e-3  # seconds, a tenth of a short deadline: what giving up a late step takes
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,8 @@ def plan(
     begun = time.perf_counter()
     work = _Refinement(planner, until, begun, planner.start(query, checked))
     work.run(late=False)
-    if not work.is_over and in_time(work.run, begun + until.seconds - time.perf_counter()) is None:
+    due = begun + until.seconds - min(HAND_OVER, 0.1 * until.seconds)
+    if not work.is_over and in_time(work.run, due - time.perf_counter()) is None:
         work.given_up = True
         log.info("refinement %d is late and left out", work.done + 1)
     state = work.state
