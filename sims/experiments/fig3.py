@@ -316,7 +316,8 @@ def entries(document: dict[str, Any]) -> list[Entry]:
             row = means.get(n)
             remark = document["absent"].get(key, "")
             if row is not None:
-                remark = f"After {seconds(row['seconds'])}."
+                spent = row["seconds"]
+                remark = "Every query failed." if spent is None else f"After {seconds(spent)}."
                 if row["reached"] < claim:
                     remark += " Below the claim: see the notes on the faithful algorithm."
             elif not remark:
