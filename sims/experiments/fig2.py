@@ -260,6 +260,15 @@ def entries(document: dict[str, Any]) -> list[Entry]:
             found.append(
                 Entry(f"Figure 2, {label}: {what}", seconds(claim), ours=ours, remark=remark)
             )
+            if name == "faithful" and (anytime := document["curves"].get("anytime")):
+                found.append(
+                    Entry(
+                        f"Figure 2, {label} with any-time settings: {what}",
+                        seconds(claim),
+                        ours=seconds(first(anytime, most), "never"),
+                        remark=remark,
+                    )
+                )
     ours = document["curves"].get("adapt") or document["curves"].get("eikonal")
     if ours:
         found.append(
