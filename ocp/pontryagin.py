@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.collocation import solve_collocation
 from ocp.extremals.candidates import candidate_guesses
-from ocp.extremals.extremal import Extremal, find_extremal
+from ocp.extremals.extremal import Extremal, Precision, find_extremal
 from ocp.extremals.warm_start import onward, policy_of, rollouts
 from ocp.query import Query
 from ocp.trajectory import SolveError, Status, Trajectory
@@ -80,8 +80,7 @@ def solve_pmp(
             start,
             rough,
             segments=segments,
-            tolerance=tolerance,
-            max_iterations=max_iterations,
+            precision=Precision(newton=tolerance, iterations=max_iterations),
         )
         if extremal.trajectory is not None:
             return extremal.trajectory

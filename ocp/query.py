@@ -197,6 +197,14 @@ class Query:
             return get_model_file(self.model.path)
         return get_model(self.model)
 
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Kept, since most of what is derived from a query is looked up by it."""
+        return hash(tuple(getattr(self, f.name) for f in fields(self)))
+
     def __getstate__(self) -> dict[str, Any]:
         """Only the data: what is derived from it is made anew in another process."""
         return {f.name: self.__dict__[f.name] for f in fields(self)}
@@ -225,7 +233,7 @@ class Query:
             upper = np.minimum(upper, self.input_upper)
         return lower, upper
 
-    @property
+    @cached_property
     def is_bounded(self) -> bool:
         """Whether any input is bounded."""
         lower, upper = self.input_bounds

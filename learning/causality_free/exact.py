@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from learning.causality_free.sidestep import Sidesteps, nearness
 from ocp.compiled.batch import optimal_inputs, running_costs
-from ocp.extremals.extremal import SEGMENTS, find_extremal
+from ocp.extremals.extremal import SEGMENTS, Precision, find_extremal
 from ocp.extremals.transversality import quadratic_condition
 from ocp.extremals.warm_start import advanced
 from ocp.query import Query
@@ -30,7 +30,7 @@ TAIL = 3e-4  # of the cost, that may be left where the linear regulator takes ov
 LONGEST = 20.0  # seconds of a guess
 DETOUR = 1.7  # times the longest motion known, that one past another side may last
 STEP = 0.02  # seconds of a guess's step, at most
-STEP_TOLERANCE = 1e-11  # of the integration
+PRECISION = Precision(step=1e-11)
 GROWTH, MAX_SEGMENTS = 1.5, 200  # exponent by which errors may grow in a segment; how many
 FIRST_SHARE = 0.4  # of the way (to the start, to the obstacles' weight) where continuation begins
 MOST_CONTINUATIONS = 16  # motions tried
@@ -114,7 +114,7 @@ def exact_from(query: Query, guess: Trajectory) -> Optimum | None:
         guess,
         quadratic_condition(center, P),
         segments=_segments(query, guess.duration),
-        step_tolerance=STEP_TOLERANCE,
+        precision=PRECISION,
     )
     motion = found.trajectory
     if motion is None or motion.costates is None:

@@ -33,9 +33,6 @@ Array = NDArray[np.float64]
 SEGMENTS = 24
 REFINEMENTS = 2  # how often segments are halved where a converged answer is not accurate enough
 SAMPLES = 8  # points of the answer in each segment
-NEWTON_TOLERANCE = 1e-7  # the last correction, relative; the answer's error is its square
-STEP_TOLERANCE = 1e-8  # of the integration, relative
-CHECK_TOLERANCE = 1e-11  # of the second integration
 MAX_GAP = 1e-5  # between both integrations, over one segment and its growth of errors
 MAX_HAMILTONIAN = 1e-6  # |H| allowed where it should be 0, relative to the largest W
 MAX_DEPTH = 1e-9  # inside the goal before the end, relative to its radius
@@ -46,6 +43,26 @@ WHY = {
     SINGULAR: "the linearised problem is singular",
     BROKEN: "an iterate could not be integrated",
 }
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How exactly an extremal is solved for; all tolerances are relative to 1 + size.
+
+    Attributes:
+        newton: of the last Newton correction; the answer's error is its square.
+        step: of a step of the integration.
+        check: of a step of the second integration, which the answer's cost comes from.
+        iterations: the most of Newton's method.
+    """
+
+    newton: float = 1e-7
+    step: float = 1e-8
+    check: float = 1e-11
+    iterations: int = 40
+
+
+EXACT = Precision()
 
 
 @dataclass(frozen=True)
@@ -104,9 +121,7 @@ def find_extremal(
     condition: Condition | None = None,
     *,
     segments: int = SEGMENTS,
-    tolerance: float = NEWTON_TOLERANCE,
-    step_tolerance: float = STEP_TOLERANCE,
-    max_iterations: int = 40,
+    precision: Precision = EXACT,
 ) -> Extremal:
     """The extremal near `guess`; never raises for want of convergence.
 
@@ -116,23 +131,20 @@ def find_extremal(
         guess: a motion from near `start` to near the goal (or lasting the fixed time).
         condition: the end's; by default the goal's.
         segments: of multiple shooting.
-        tolerance: of the last Newton correction, relative to 1 + size.
-        step_tolerance: of the integration, likewise.
-        max_iterations: of Newton's method.
+        precision: of the answer.
     """
     condition = condition or goal_condition(query)
     start = np.ascontiguousarray(start, dtype=float)
     if condition.at_goal:
         guess = until_goal(query, guess)
     guess = with_costates(query, guess)
-    settings = np.array([tolerance, step_tolerance, max_iterations, LEAST_DAMPING])
-    shot = _shoot(query, condition, start, guess, segments, settings)
+    shot = _shoot(query, condition, start, guess, segments, precision)
     iterations, seconds = shot.iterations, shot.seconds
     for _ in range(REFINEMENTS):
         if shot.motion is None or not shot.detail:
             break
         segments *= 2
-        shot = _shoot(query, condition, start, shot.motion, segments, settings)
+        shot = _shoot(query, condition, start, shot.motion, segments, precision)
         iterations, seconds = iterations + shot.iterations, seconds + shot.seconds
     if shot.motion is None or shot.detail:
         return Extremal(Status.NOT_CONVERGED, shot.detail, iterations, seconds)
@@ -163,7 +175,7 @@ def _shoot(
     start: Array,
     guess: Trajectory,
     segments: int,
-    settings: Array,
+    precision: Precision,
 ) -> _Shot:
     n = query.system.n
     fractions, nodes = first_nodes(guess, segments)
@@ -172,7 +184,9 @@ def _shoot(
     functions, q, layout = shooting_addresses(query), parameters(query), flow_layout(query)
     # Near the goal costates and costs are small themselves.
     small = min(max(guess.cost, 1e-5), 1.0) if condition.at_goal else 1.0
-    settings = settings * [small, small, 1.0, 1.0]
+    settings = np.array(
+        [small * precision.newton, small * precision.step, precision.iterations, LEAST_DAMPING]
+    )
     begun = time.perf_counter()
     ended, iterations, duration, _ = shoot(
         condition.kind, condition.at_goal, functions, q, layout, condition.terms, settings,
@@ -183,7 +197,7 @@ def _shoot(
         detail = WHY.get(ended, f"no convergence in {iterations} iterations")
         return _Shot(iterations, seconds, detail, None, basis)
     nodes[0, :n] = start
-    look = look_again(query, fractions, nodes, duration, SAMPLES, small * CHECK_TOLERANCE)
+    look = look_again(query, fractions, nodes, duration, SAMPLES, small * precision.check)
     if not look.gap < np.inf:
         return _Shot(iterations, seconds, "the answer could not be integrated again", None, basis)
     detail = ""

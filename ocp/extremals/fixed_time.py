@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ocp.extremals.extremal import SEGMENTS, find_extremal
+from ocp.extremals.extremal import SEGMENTS, Precision, find_extremal
 from ocp.extremals.guess import default_guesses
 from ocp.extremals.transversality import quadratic_condition
 from ocp.kernels import kernels, parameters
@@ -16,7 +16,7 @@ from ocp.trajectory import SolveError, Status, Trajectory
 Array = NDArray[np.float64]
 
 MAX_SEGMENTS = 400
-STEP_TOLERANCE = 1e-11
+PRECISION = Precision(step=1e-11)
 GROWTH = 1.5  # exponent by which a segment's errors may grow
 
 
@@ -93,7 +93,7 @@ def solve_fixed_time(
             _lasting(rough, horizon),
             condition,
             segments=segments,
-            step_tolerance=STEP_TOLERANCE,
+            precision=PRECISION,
         )
         if extremal.trajectory is not None and extremal.hessian is not None:
             offset = extremal.trajectory.states[-1] - center
