@@ -258,9 +258,6 @@ class ScapegoatDoor(Door):
             future.set_result(fn(*args, **kwargs))
         return future
 
-    def gave_up(self, error: BaseException) -> bool:
-        return isinstance(error, self.GivenUpError)
-
 
 def test_a_task_is_given_up_only_after_it_was_tried_alone() -> None:
     door = ScapegoatDoor(guilty=0)
