@@ -110,6 +110,7 @@ class MetaPlanner:
             SolveError: NOT_APPLICABLE if the network cannot know such a query.
         """
         begun = time.perf_counter()
+        self.clock.forget()
         encoder = QueryEncoder.of(query)
         chosen = next((p for p in self.networks if p.knows(query)), None)
         if chosen is None:

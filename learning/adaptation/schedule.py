@@ -5,6 +5,8 @@ from functools import cache
 
 USUAL = {4_500: 3e-3, 9_000: 4.7e-3, 18_000: 8e-3, 60_000: 28e-3, 240_000: 125e-3}
 """Nodes, and the seconds that one solve usually takes: only ratios matter."""
+TRAJECTORY = 2e-3  # seconds that an exact one usually takes
+FORGOTTEN = 0.02  # part of what was learned of the machine, with each plan
 COARSE = 4_500  # answers where the network's check fails
 FIRST = 18_000  # begun together with the network, unless a deadline has it otherwise
 TRAJECTORIES = 8  # exact ones, from states of the planner's choice if no starts are asked for
@@ -52,8 +54,8 @@ class Clock:
         doubted: of "grid" and "trajectory" those whose last time was out of all proportion.
     """
 
-    trajectory: float = 3e-3
-    motion: float = 0.4e-3
+    trajectory: float = TRAJECTORY
+    motion: float = 0.3e-3
     pace: float = 1.0
     doubted: set[str] = field(default_factory=set)
 
@@ -92,8 +94,15 @@ class Clock:
             self.pace += 0.5 * (pace - self.pace)
         else:
             self.trajectory += 0.3 * (seconds - self.trajectory)
-            # A pace that was too slow for any grid is not seen again: it is forgotten in time.
-            self.pace += 0.02 * (1.0 - self.pace)
+
+    def forget(self) -> None:
+        """Come back a little to what is usual; once a plan.
+
+        A step that seems too slow for any deadline is never taken, so nothing else would tell that
+        it is fast again.
+        """
+        self.trajectory += FORGOTTEN * (TRAJECTORY - self.trajectory)
+        self.pace += FORGOTTEN * (1.0 - self.pace)
 
 
 @cache

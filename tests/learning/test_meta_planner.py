@@ -348,9 +348,12 @@ def test_the_first_grid_is_the_finest_that_ends_before_the_deadline() -> None:
     assert clock.first_grid(40, 0.02) < clock.first_grid(1, 0.02)
 
 
-def test_a_pace_too_slow_for_any_grid_is_forgotten_in_time() -> None:
-    clock = Clock(pace=30.0)
+def test_what_was_too_slow_for_any_deadline_is_forgotten_in_time(problem) -> None:
+    name, query, starts, _ = problem
+    clock = Clock(trajectory=1.0, pace=100.0)
+    planner = replace(MetaPlanner.pretrained(name, seconds=0.02), clock=clock)
     assert clock.first_grid(1, 0.02) == 0
     for _ in range(400):
-        clock.learn(Step(start=0), clock.trajectory)
+        planner.start(query, starts)
     assert clock.first_grid(1, 0.02) > 0
+    assert clock.expected(Step(start=0)) < 0.01
