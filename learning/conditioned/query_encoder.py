@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ocp.compiled.function_address import ADDRESSES, addresses, function_at
 from ocp.compiled.jit import KERNEL_WITH_JACOBIAN, MATRIX, SCALAR, VECTOR, compiled
-from ocp.grids import goal_table as table_kernels
-from ocp.grids.goal_table import VALUE_AND_GRADIENT, GoalTable, goal_table, has_goal_table
+from ocp.grids.goal_look_up import VALUE_AND_GRADIENT, value_and_gradient
+from ocp.grids.goal_table import GoalTable, goal_table, has_goal_table
 from ocp.kernels import Kernels, kernels, parameters
 from ocp.query import Goal, Query
 from ocp.query_family import paper_query
@@ -123,7 +123,7 @@ class QueryEncoder:
 
 @cache
 def _addresses(of_query: Kernels) -> NDArray[np.intp]:
-    lookup = addresses([table_kernels.value_and_gradient])
+    lookup = addresses([value_and_gradient])
     derivatives, cost = of_query.state_cost_derivatives, of_query.state_cost
     return np.concatenate([lookup, addresses([derivatives]), addresses([cost])])
 
