@@ -8,6 +8,7 @@ import torch
 
 from learning.conditioned import training, training_run
 from learning.conditioned.pretrained_weights import read_pretrained
+from learning.conditioned.query_encoder import REACH
 from learning.conditioned.training import TrainingSettings
 from learning.conditioned.training_data import family_tensors
 from learning.conditioned.value_function import Widths
@@ -15,11 +16,16 @@ from learning.conditioned.value_samples import (
     SampleSizes,
     SampleTask,
     input_directions,
+    known_values,
     sample_query,
 )
 from ocp.compiled.batch import minimised_hamiltonians
+from ocp.eikonal import solve_eikonal
 from ocp.execution import InProcess
+from ocp.grid import Grid
+from ocp.grids.goal_table import goal_table
 from ocp.pontryagin import exact_trajectory
+from ocp.query_family import paper_query
 from ocp.query_file import query_from_dict
 
 SETTINGS = TrainingSettings(
@@ -54,6 +60,28 @@ def test_sampled_values_are_the_optimal_ones(samples):
                 errors.append(value / exact_trajectory(query, x).cost - 1)
     assert np.median(np.abs(errors)) < 0.01
     assert len(errors) >= 8
+
+
+def test_square_to_the_ray_to_the_goal_values_have_no_kink_of_the_empty_worlds():
+    """There V without obstacles has a kink, which V beside an obstacle has not."""
+    query = paper_query((3.74, 2.17))  # three obstacles; the state lies off V's own kinks
+    square = np.arctan2(2.17 + 4.49, 3.74 - 2.19) - np.pi / 2
+    headings = square + np.linspace(-0.15, 0.15, 7)
+    states = np.array([(2.19, -4.49, h) for h in headings])
+    table = goal_table(query, REACH)
+    grid = solve_eikonal(query, Grid.for_query(query, 240_000, margin=0.5)).value.on_grid
+    known = known_values(query, table, grid, states)
+    optima = [exact_trajectory(query, x) for x in states]
+    smooth = known.smooth
+    assert smooth[3:].all(), "from the kink of the empty world on"
+    # That kink, 4 a radian, would raise V between two nodes 0.12 rad apart by up to 0.06.
+    costs = np.array([o.cost for o in optima])
+    assert known.values[smooth] == pytest.approx(costs[smooth], abs=0.012)
+    first = [o.costates[0] for o in optima if o.costates is not None]
+    slopes = np.einsum("kn,knm->km", first, input_directions(query, states))
+    cosine = (slopes * known.slopes).sum(axis=1) / np.linalg.norm(slopes, axis=1)
+    cosine /= np.linalg.norm(known.slopes, axis=1)
+    assert (cosine[smooth] > 0.99).all()
 
 
 def test_smooth_samples_satisfy_the_hamilton_jacobi_equation(samples):

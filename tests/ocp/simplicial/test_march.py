@@ -19,9 +19,10 @@ from ocp.obstacle import Obstacle
 from ocp.query import Goal, Query
 from ocp.query_family import paper_query
 from ocp.refmm import uniform_mesh
+from ocp.simplicial.feet import GOAL
 from ocp.simplicial.mesh import Mesh
 from ocp.simplicial.solution import MeshSolution, solve_on_mesh
-from ocp.simplicial.stencils import GOAL, merged, stencils
+from ocp.simplicial.stencils import merged, stencils
 from ocp.trajectory import SolveError, Status
 
 UNICYCLE = paper_query((1.0, 1.0))
