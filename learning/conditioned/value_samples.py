@@ -1,12 +1,15 @@
 """Samples of optimal values to learn from: cheap, since a grid solves a query in milliseconds.
 
 Each query is solved twice by fast marching: over its whole domain, and finely around its goal.
-States are drawn uniformly, along closed loops (where policies will be), and near the goal. At
-states where the gradient of the grid does not satisfy the Hamilton-Jacobi equation, V is not
-smooth (two classes of motions cost about the same); there only the value is learned.
+States are drawn uniformly, along closed loops (where policies will be), near the goal, and heading
+about square to the ray to the goal. There the value without obstacles has a kink, forward being as
+good as backward; among obstacles V's own lies elsewhere, and the network, a multiple of the value
+without, must cancel it: what is left traps a robot.
 
 Between nodes V minus the exact value without obstacles is interpolated: unlike V, this difference
-is smooth at the goal.
+is smooth at the goal. Where its gradient does not satisfy the Hamilton-Jacobi equation but V's own
+does, as beside that kink, V is interpolated. Where neither does V is not smooth (two classes of
+motions cost about the same); there only the value is learned.
 """
 
 import hashlib
@@ -32,9 +35,10 @@ Floats = NDArray[np.float64]
 MARGIN = 0.5  # metres beyond the domain: optimal motions may leave it
 AROUND = 1.0  # metres: the fine grid's border around the goal
 FINE_NODES = 20_000
-NEAR, FAR = 0.03, 0.6  # metres from the goal of the samples from the fine grid
+NEAR, FAR = 0.003, 0.6  # metres from the goal of the samples from the fine grid
 LOOPS = 12
 SCATTER = (0.1, 0.1, 0.2)  # of states off their closed loops
+SQUARE = 0.1  # radians off square to the ray to the goal
 RESIDUAL = 0.06  # relative, of the Hamilton-Jacobi equation where V is smooth
 
 
@@ -81,10 +85,13 @@ def sample_values(query: Query, sizes: SampleSizes, rng: np.random.Generator) ->
     """Samples of one query."""
     coarse = solve_eikonal(query, Grid.for_query(query, sizes.nodes, margin=MARGIN))
     fine = solve_eikonal(query, _around_goal(query)).value.on_grid
-    near_count, loop_count = sizes.states // 5, 2 * sizes.states // 5
+    near_count, loop_count, square = sizes.states // 5, 3 * sizes.states // 10, sizes.states // 5
     anywhere = sizes.states - near_count - loop_count
     starts = np.array([sample_start(query, rng) for _ in range(max(anywhere, LOOPS))])
-    loops = [r for r in rollouts(query, coarse.policy(), starts[:LOOPS]) if r is not None]
+    rays = query.reference[:2] - starts[:square, :2]
+    side = np.pi / 2 * rng.choice([-1.0, 1.0], len(rays)) + SQUARE * rng.normal(size=len(rays))
+    starts[:square, 2] = np.arctan2(rays[:, 1], rays[:, 0]) + side
+    loops = [r for r in rollouts(query, coarse.policy(), starts[-LOOPS:]) if r is not None]
     path = np.concatenate([starts[:1], *(r.states for r in loops)])
     followed = path[rng.integers(len(path), size=loop_count)]
     followed = followed + rng.normal(size=followed.shape) * SCATTER
@@ -95,8 +102,10 @@ def sample_values(query: Query, sizes: SampleSizes, rng: np.random.Generator) ->
     near = np.column_stack([place, headings])
     table = goal_table(query, REACH)
     parts = [
-        _known(query, table, coarse.value.on_grid, np.concatenate([starts[:anywhere], followed])),
-        _known(query, table, fine, near),
+        known_values(
+            query, table, coarse.value.on_grid, np.concatenate([starts[:anywhere], followed])
+        ),
+        known_values(query, table, fine, near),
     ]
     return ValueSamples(
         *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ValueSamples))
@@ -117,22 +126,31 @@ def _around_goal(query: Query) -> Grid:
     )
 
 
-def _known(query: Query, table: GoalTable, value: GridValue, states: Floats) -> ValueSamples:
+def known_values(query: Query, table: GoalTable, value: GridValue, states: Floats) -> ValueSamples:
     """What a grid knows at the states that lie well in its box and outside the goal."""
     states = states[query.goal_distance(states) > 0.5 * NEAR]
     states = states[np.asarray(value.grid.contains(states))]
     rise = GridValue(value.grid, value.values - table.on_product(*value.grid.axes))
     values = rise.value(states) + table.value(states)
-    gradients = rise.gradient(states) + table.gradient(states)
     directions = input_directions(query, states)
-    slopes = np.einsum("kn,knm->km", gradients, directions)
-    effort = 0.5 * np.linalg.norm(slopes / np.sqrt(query.input_weights), axis=1)
-    needed = np.sqrt(state_costs(query, states))
+    slopes = np.einsum("kn,knm->km", rise.gradient(states) + table.gradient(states), directions)
+    smooth = _satisfied(query, states, slopes)
+    own = np.einsum("kn,knm->km", value.gradient(states), directions)
+    better = ~smooth & _satisfied(query, states, own)
+    values = np.where(better, value.value(states), values)
+    slopes = np.where(better[:, None], own, slopes)
+    smooth |= better
     shift = value.grid.spacing * [1, 1, 0]  # as far as the gradient reaches
-    smooth = np.abs(effort - needed) < RESIDUAL * needed
     smooth &= np.asarray(value.grid.contains(states + shift))
     smooth &= np.asarray(value.grid.contains(states - shift))
     return ValueSamples(states, values, slopes, smooth)
+
+
+def _satisfied(query: Query, states: Floats, slopes: Floats) -> NDArray[np.bool_]:
+    """Whether grad V' G `[k, m]` satisfies the Hamilton-Jacobi equation at states `[k, n]`."""
+    effort = 0.5 * np.linalg.norm(slopes / np.sqrt(query.input_weights), axis=1)
+    needed = np.sqrt(state_costs(query, states))
+    return np.abs(effort - needed) < RESIDUAL * needed
 
 
 @dataclass(frozen=True)
