@@ -5,9 +5,11 @@ Exit status: 0 success, 2 bad input, 3 nothing that was asked could be solved.
 """
 
 import logging
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Annotated, Literal
 
 import tyro
@@ -34,9 +36,8 @@ class Common:
         if self.out is not None:
             with reading_input():
                 self.out.mkdir(parents=True, exist_ok=True)
-                probe = self.out / ".writable"
-                probe.touch()
-                probe.unlink()
+                with TemporaryFile(dir=self.out):  # no name that another run could use too
+                    pass
 
 
 @dataclass(frozen=True)
@@ -247,14 +248,14 @@ Command = (
 def main() -> None:
     """Parse the command line, run the command, exit with its status."""
     one_thread_by_default()
-    command = tyro.cli(
-        Command,  # pyright: ignore[reportArgumentType]
-        prog="zermelo",
-        description="Near-optimal feedback policies, with the exact optimum beside them.",
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(message)s")
     try:
+        command = tyro.cli(
+            Command,  # pyright: ignore[reportArgumentType]
+            prog="zermelo",
+            description="Near-optimal feedback policies, with the exact optimum beside them.",
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+        logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(message)s")
         command.prepare_out()
         status = command.run()
     except BadInputError as error:
@@ -263,4 +264,7 @@ def main() -> None:
     except KeyboardInterrupt:
         print("zermelo: interrupted", file=sys.stderr)
         status = 130
+    except BrokenPipeError:  # nobody reads on, as behind `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 141
     sys.exit(status)

@@ -1,6 +1,8 @@
 """The command line: what it prints, how it ends, what it refuses."""
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -133,6 +135,21 @@ def test_bad_input_ends_in_status_2_and_names_the_field(arguments, message, run)
     assert status == 2
     assert message in err
     assert out == ""
+
+
+def test_a_reader_that_stops_reading_gets_no_traceback() -> None:
+    """As `zermelo bench --help | head -1`."""
+    command = subprocess.Popen(
+        [sys.executable, "-c", "from sims.cli import main; main()", "bench", "--help"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
+    assert command.stdout is not None
+    assert command.stderr is not None
+    command.stdout.close()
+    assert command.stderr.read() == b""
+    assert command.wait() == 141
 
 
 def test_an_output_folder_that_cannot_be_made_is_refused_first(run, tmp_path: Path) -> None:
