@@ -52,10 +52,10 @@ assert excesses[-1] < 0.005
 # %% [markdown]
 # ## Where the value is wrong, before and after
 #
-# Against a fine grid, least over heading. The network's largest errors lie where two ways are
-# equally good: there V has a kink that a smooth network rounds off. After adaptation a coarse grid
-# steers off the tubes, since its loops cost less: it keeps the kinks, and pays with its mesh's own
-# small error everywhere. So the median error may grow while the largest ones shrink.
+# Against a fine grid, least over heading. The largest errors lie where two ways are equally good:
+# there V has a kink, which a network rounds off and a grid blurs. Adaptation is local: in tubes
+# around the exact trajectories V is known to second order. Elsewhere the network stands, or a grid,
+# where its closed loops cost less. So the map hardly changes, while the robot's cost does.
 
 # %%
 fine = solve_eikonal(query, nodes=240_000).value
@@ -79,14 +79,14 @@ figure.colorbar(shown, ax=axes[:2], label="over the fine grid (%)", extend="both
 draw_plan(axes[2], query, loops, optima)
 axes[2].set_title("closed loops after adaptation; optima dashed")
 plt.show()
-assert max(medians.values()) < 1.0
-assert tails["after adaptation"] <= tails["network alone"]
+assert max(medians.values()) < 0.2
+assert max(tails.values()) < 1.5
 
 # %% [markdown]
 # ## Gradient against costate
 #
-# Along an optimal trajectory the costate is the gradient of V. Beside a kink the network's gradient
-# is that of the other way round the obstacle; the exact trajectory puts it right.
+# Along an optimal trajectory the costate is the gradient of V. The network's is off by some per
+# cent, most beside obstacles; in the tube of the exact trajectory it is exact.
 
 # %%
 motion = optima[0]

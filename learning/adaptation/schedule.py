@@ -68,11 +68,12 @@ class Clock:
     def first_grid(self, asked: int, seconds: float) -> int:
         """Nodes of the finest grid, up to `FIRST`, that ends well before a deadline; 0 for none.
 
-        What is left of it is for the exact trajectories that the grid asks for.
+        What is left of it is for the exact trajectories that the grid asks for. One as coarse as
+        `COARSE` knows less than the networks, and would take time from exact trajectories.
         """
         most = GRID_PART * seconds
-        timely = (n for n in USUAL if n <= FIRST and self.expected(Step(nodes=n), asked) <= most)
-        return max(timely, default=0)
+        sizes = [n for n in USUAL if COARSE < n <= FIRST]
+        return max((n for n in sizes if self.expected(Step(nodes=n), asked) <= most), default=0)
 
     def learn(self, step: Step, seconds: float, motions: int = 0) -> None:
         """Take note of a step's time.

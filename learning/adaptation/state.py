@@ -1,7 +1,7 @@
 """What is known of a query, and how a grid or an exact trajectory is taken into it."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from ocp.query import Query
 from ocp.value import Policy, Value
 
 Floats = NDArray[np.float64]
+
+DOUBT = 1.002  # two rough closed loops that are equally good differ in cost by less
 
 
 @dataclass(frozen=True)
@@ -34,19 +36,10 @@ class Base:
     costs: Floats
     nodes: int
 
-    def yields_to(self, other: "Base", free: list[int]) -> bool:
-        """Whether another should be the base, where the starts outside the tubes are `free`.
-
-        The closed loops from these tell: more of them arrive, or all together they cost less. If
-        there are none, the size tells.
-        """
-        if not free:
-            return other.nodes > self.nodes
-        ours, theirs = self.costs[free], other.costs[free]
-        lost, kept = np.isinf(theirs).sum(), np.isinf(ours).sum()
-        if lost != kept:
-            return bool(lost < kept)
-        return bool(theirs[np.isfinite(theirs)].sum() < ours[np.isfinite(ours)].sum())
+    def lost_and_spent(self, free: list[int]) -> tuple[int, float]:
+        """How many closed loops from the starts `free` do not arrive, and what the others cost."""
+        costs = self.costs[free]
+        return int(np.isinf(costs).sum()), float(costs[np.isfinite(costs)].sum())
 
 
 @dataclass(frozen=True)
@@ -100,9 +93,21 @@ class MetaState:
 
     @cached_property
     def base(self) -> Base:
-        """The best of those known, for the starts outside the tubes."""
+        """The best of those known, for the starts outside the tubes.
+
+        The closed loops from these tell: more of them arrive, or all together they cost less, by
+        more than such rough loops are wrong. Else the finest is.
+        """
+        finest = max(self.bases, key=lambda base: base.nodes)
         free = [i for i in range(self.asked) if not self.is_steered(i)]
-        return reduce(lambda best, b: b if best.yields_to(b, free) else best, self.bases)
+        if not free:
+            return finest
+
+        def judged(base: Base) -> tuple[int, float]:
+            lost, spent = base.lost_and_spent(free)
+            return lost, spent if base is finest else spent * DOUBT
+
+        return min([finest, *self.bases], key=judged)
 
     @cached_property
     def tubes(self) -> Tubes | None:

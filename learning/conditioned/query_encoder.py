@@ -28,11 +28,11 @@ from ocp.trajectory import SolveError, Status
 Floats = NDArray[np.float64]
 
 REACH = 16.0  # metres from the goal up to which the value without obstacles is known
-NEAREST = 0.04
+NEAREST = 1e-3
 """V without obstacles below which its logarithm is a feature no longer.
 
-No state of the training lies nearer the goal, and V follows V without obstacles there. Extrapolated
-along the logarithm, the learned factor grew faster than V fell, and robots stopped 1 cm short.
+Hardly a state of the training lies nearer the goal. Extrapolated along the logarithm, the learned
+factor might grow faster than V falls, and robots stop short.
 """
 STATE_FEATURES, OBSTACLE_FEATURES = 9, 12
 ODD_STATE, ODD_OBSTACLE = (1,), (1, 5, 8)

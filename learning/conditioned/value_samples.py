@@ -6,10 +6,11 @@ about square to the ray to the goal. There the value without obstacles has a kin
 good as backward; among obstacles V's own lies elsewhere, and the network, a multiple of the value
 without, must cancel it: what is left traps a robot.
 
-Between nodes V minus the exact value without obstacles is interpolated: unlike V, this difference
-is smooth at the goal. Where its gradient does not satisfy the Hamilton-Jacobi equation but V's own
-does, as beside that kink, V is interpolated. Where neither does V is not smooth (two classes of
-motions cost about the same); there only the value is learned.
+Beside the goal V is taken from backward characteristics, which are exact; a grid's cells there have
+nodes within the goal and without. Farther off it is interpolated: V minus the exact value without
+obstacles, which is the smoother near the goal. Where its gradient does not satisfy the
+Hamilton-Jacobi equation but V's own does, as beside that kink, V is interpolated. Where neither
+does V is not smooth (two classes of motions cost about the same); there only the value is learned.
 """
 
 import hashlib
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from learning.conditioned.query_encoder import REACH
 from ocp.compiled.batch import rates, state_costs
 from ocp.eikonal import solve_eikonal
+from ocp.extremals.characteristics import backward_characteristics
 from ocp.extremals.warm_start import rollouts
 from ocp.family_file import load_family
 from ocp.grid import Grid, GridValue
@@ -35,7 +37,10 @@ Floats = NDArray[np.float64]
 MARGIN = 0.5  # metres beyond the domain: optimal motions may leave it
 AROUND = 1.0  # metres: the fine grid's border around the goal
 FINE_NODES = 20_000
-NEAR, FAR = 0.003, 0.6  # metres from the goal of the samples from the fine grid
+NEAREST, NEAR, FAR = 0.003, 0.2, 0.6
+"""Metres from the goal: up to NEAR samples are of characteristics, up to FAR of a fine grid."""
+NEAR_COST = 3.0  # of the longest characteristics: from NEAR it is about 1 if obstacles add nothing
+GRAZING = 0.5  # share of characteristics that end nearly tangentially, where headings change most
 LOOPS = 12
 SCATTER = (0.1, 0.1, 0.2)  # of states off their closed loops
 SQUARE = 0.1  # radians off square to the ray to the goal
@@ -85,8 +90,9 @@ def sample_values(query: Query, sizes: SampleSizes, rng: np.random.Generator) ->
     """Samples of one query."""
     coarse = solve_eikonal(query, Grid.for_query(query, sizes.nodes, margin=MARGIN))
     fine = solve_eikonal(query, _around_goal(query)).value.on_grid
-    near_count, loop_count, square = sizes.states // 5, 3 * sizes.states // 10, sizes.states // 5
-    anywhere = sizes.states - near_count - loop_count
+    beside, near_count = 3 * sizes.states // 20, sizes.states // 20
+    loop_count, square = 3 * sizes.states // 10, sizes.states // 5
+    anywhere = sizes.states - beside - near_count - loop_count
     starts = np.array([sample_start(query, rng) for _ in range(max(anywhere, LOOPS))])
     rays = query.reference[:2] - starts[:square, :2]
     side = np.pi / 2 * rng.choice([-1.0, 1.0], len(rays)) + SQUARE * rng.normal(size=len(rays))
@@ -96,7 +102,7 @@ def sample_values(query: Query, sizes: SampleSizes, rng: np.random.Generator) ->
     followed = path[rng.integers(len(path), size=loop_count)]
     followed = followed + rng.normal(size=followed.shape) * SCATTER
     angles, headings = rng.uniform(-np.pi, np.pi, (2, near_count))
-    gaps = np.exp(rng.uniform(np.log(NEAR), np.log(FAR), near_count))
+    gaps = rng.uniform(NEAR, FAR, near_count)
     radius = (query.goal.radius + gaps)[:, None]
     place = query.reference[:2] + radius * np.column_stack([np.cos(angles), np.sin(angles)])
     near = np.column_stack([place, headings])
@@ -106,6 +112,7 @@ def sample_values(query: Query, sizes: SampleSizes, rng: np.random.Generator) ->
             query, table, coarse.value.on_grid, np.concatenate([starts[:anywhere], followed])
         ),
         known_values(query, table, fine, near),
+        beside_goal(query, beside, rng),
     ]
     return ValueSamples(
         *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ValueSamples))
@@ -127,8 +134,8 @@ def _around_goal(query: Query) -> Grid:
 
 
 def known_values(query: Query, table: GoalTable, value: GridValue, states: Floats) -> ValueSamples:
-    """What a grid knows at the states that lie well in its box and outside the goal."""
-    states = states[query.goal_distance(states) > 0.5 * NEAR]
+    """What a grid knows at the states that lie well in its box and not beside the goal."""
+    states = states[query.goal_distance(states) > NEAR]
     states = states[np.asarray(value.grid.contains(states))]
     rise = GridValue(value.grid, value.values - table.on_product(*value.grid.axes))
     values = rise.value(states) + table.value(states)
@@ -144,6 +151,35 @@ def known_values(query: Query, table: GoalTable, value: GridValue, states: Float
     smooth &= np.asarray(value.grid.contains(states + shift))
     smooth &= np.asarray(value.grid.contains(states - shift))
     return ValueSamples(states, values, slopes, smooth)
+
+
+def beside_goal(query: Query, count: int, rng: np.random.Generator) -> ValueSamples:
+    """Up to `count` samples between NEAREST and NEAR from the goal, spread evenly by logarithm.
+
+    Each is a point of a characteristic, which is optimal up to where the robot is square to the ray
+    to the goal: there the way round the other side is as good.
+    """
+    angles, headings = rng.uniform(-np.pi, np.pi, (2, count))
+    off = np.exp(rng.uniform(np.log(0.01), np.log(0.5), count)) * rng.choice([-1.0, 1.0], count)
+    grazing = angles + np.pi / 2 * rng.choice([-1.0, 1.0], count) + off
+    headings = np.where(rng.random(count) < GRAZING, grazing, headings)
+    rim = query.goal.radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    ends = np.column_stack([query.reference[:2] + rim, headings])
+    fan = backward_characteristics(query, ends, NEAR_COST, tolerance=1e-8, max_points=200)
+    distance = query.goal_distance(fan.states)
+    bearing = np.arctan2(*(fan.states[..., :2] - query.reference[:2]).transpose(2, 0, 1)[::-1])
+    facing = np.cos(fan.states[..., 2] - bearing)
+    turned = np.cumsum(~(facing * facing[:, :1] > 0), axis=1) > 0
+    wanted = np.exp(rng.uniform(np.log(NEAREST), np.log(NEAR), count))
+    off = np.abs(np.log(np.maximum(distance, 1e-9) / wanted[:, None]))
+    off[turned | ~(distance > NEAREST / 2) | ~(distance < NEAR)] = np.inf
+    rows, points = np.arange(count), np.argmin(off, axis=1)
+    kept = np.isfinite(off[rows, points])
+    rows, points = rows[kept], points[kept]
+    states, costates = fan.states[rows, points], fan.costates[rows, points]
+    slopes = np.einsum("kn,knm->km", costates, input_directions(query, states))
+    values = fan.costs[rows, points]
+    return ValueSamples(states, values, slopes, np.ones(len(rows), dtype=bool))
 
 
 def _satisfied(query: Query, states: Floats, slopes: Floats) -> NDArray[np.bool_]:

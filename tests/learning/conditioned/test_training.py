@@ -13,8 +13,11 @@ from learning.conditioned.training import TrainingSettings
 from learning.conditioned.training_data import family_tensors
 from learning.conditioned.value_function import Widths
 from learning.conditioned.value_samples import (
+    NEAR,
+    NEAREST,
     SampleSizes,
     SampleTask,
+    beside_goal,
     input_directions,
     known_values,
     sample_query,
@@ -82,6 +85,29 @@ def test_square_to_the_ray_to_the_goal_values_have_no_kink_of_the_empty_worlds()
     cosine = (slopes * known.slopes).sum(axis=1) / np.linalg.norm(slopes, axis=1)
     cosine /= np.linalg.norm(known.slopes, axis=1)
     assert (cosine[smooth] > 0.99).all()
+
+
+@pytest.mark.parametrize("goal", [(1.0, 4.0), (0.008, 0.288)], ids=["free", "beside a circle"])
+def test_beside_the_goal_samples_are_exact(goal):
+    """Also where an obstacle's penalty reaches into the goal, and from where headings graze it."""
+    query = paper_query(goal)
+    known = beside_goal(query, 200, np.random.default_rng(4))
+    distance = query.goal_distance(known.states)
+    assert len(distance) > 150
+    assert known.smooth.all()
+    assert NEAREST / 2 < distance.min() < 0.005
+    assert 0.1 < distance.max() < NEAR
+    facing = known.states[:, 2] - np.arctan2(*(known.states[:, :2] - query.reference[:2]).T[::-1])
+    assert np.abs(np.cos(facing)).min() < 0.1
+    assert np.abs(np.cos(facing)).max() > 0.95
+    directions = input_directions(query, known.states)
+    for x, value, slopes, d in list(
+        zip(known.states, known.values, known.slopes, directions, strict=True)
+    )[::12]:
+        optimum = exact_trajectory(query, x)
+        assert value == pytest.approx(optimum.cost, rel=2e-5, abs=1e-8)
+        assert optimum.costates is not None
+        assert slopes == pytest.approx(optimum.costates[0] @ d, rel=1e-3, abs=1e-4)
 
 
 def test_smooth_samples_satisfy_the_hamilton_jacobi_equation(samples):
