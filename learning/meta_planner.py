@@ -21,6 +21,7 @@ from learning.adaptation.schedule import (
     COARSE,
     FEW,
     FIRST,
+    LAST,
     READY,
     Clock,
     Step,
@@ -49,8 +50,9 @@ class MetaPlanner:
     Attributes:
         networks: the first that knows a query is used for it.
         grids: whether to use grids at all; without, only network and exact trajectories.
-        seconds: the deadline that plans will be given, if one. Then finer grids follow the exact
-            trajectories as long as they end in time, and whatever is ready first is used first.
+        seconds: the deadline that plans will be given, if one. Then grids follow the exact
+            trajectories, ever finer as long as they end in time, and whatever is ready first is
+            used first.
         suspicion: a motion so many times as costly as a grid's loop from the same start is held
             to be in the wrong class, and one beside the grid's is sought; infinite for never.
         cores: that it may occupy. Without a deadline the answer does not depend on how many.
@@ -119,7 +121,7 @@ class MetaPlanner:
         rows = np.array(starts, dtype=float).reshape(-1, query.system.n)
         first = self._first_grid(len(rows))
         grids = Ahead(partial(solved_grid, query, rows))
-        if first and self.cores > 1:
+        if first and self.cores > 1 and self.seconds is None:
             grids = grids.begun([first], 1)
         loops = network_loops(network, rows, self.cores)
         costs = np.array([np.inf if loop is None else loop.cost for loop in loops])
@@ -169,18 +171,18 @@ class MetaPlanner:
         """Nodes of the first grid for so many starts asked for; 0 for none."""
         if not self.grids or self.seconds is None:
             return FIRST if self.grids else 0
-        return self.clock.first_grid(asked, self.seconds)
+        return self.clock.first_grid(asked, self.seconds, self.cores)
 
     def _look_ahead(self, state: MetaState) -> MetaState:
         """Have the other cores begin the next step or what comes after it.
 
-        The next grid, if few exact trajectories are left to this core before it; then those.
+        The next grid, if the last exact trajectory before it is left to this core; then those.
         """
         if self.cores < 2:
             return state
         grids, later = state.grids, next((s for s in state.pending[1:] if s.nodes), None)
-        few = sum(not s.nodes for s in state.pending) <= FEW
-        if later is not None and few and self._ends_in_time(state, later):
+        last = sum(not s.nodes for s in state.pending) <= LAST
+        if later is not None and last and self._ends_in_time(state, later):
             grids = grids.begun([later.nodes], 1)
         exact = state.exact.begun(state.sought, self.cores + 1)
         return replace(state, grids=grids, exact=exact)

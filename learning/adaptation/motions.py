@@ -24,7 +24,7 @@ MANY = 4  # starts whose loops are worth another core
 MARGIN = 0.5  # metres of the grids beyond the domain
 PRECISION = Precision(newton=1e-6, step=1e-6, check=1e-9)
 """Of the exact trajectories: costs to 1e-9, in two thirds of the time."""
-SUSPICION = 1.005  # a motion so many times as costly as a grid's loop is in the wrong class
+SUSPICION = 1.003  # a motion so many times as costly as a grid's loop is in the wrong class
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ FORGOTTEN = 0.02  # part of what was learned of the machine, with each plan
 COARSE = 4_500  # answers where the network's check fails
 FIRST = 18_000  # begun together with the network, unless a deadline has it otherwise
 TRAJECTORIES = 8  # exact ones, from states of the planner's choice if no starts are asked for
-FEW = 4  # exact trajectories left to one core while another solves the next grid
+FEW = 4  # exact trajectories that a grid must leave time for
+LAST = 1  # exact trajectories left to one core while another solves the next grid
 OUTLIER = 4.0  # a step's time counts for at most so many times what was expected
 GRID_PART = 0.85  # of a deadline for the first grid
 READY = 3e-4  # seconds to take up what another core has finished
@@ -27,12 +28,15 @@ class Step:
 def steps(asked: int, first: int, patient: bool) -> tuple[Step, ...]:
     """What there is to do for so many starts asked for.
 
-    A grid comes first: it tells from which starts the network's loop is in a wrong class.
+    Where a number of trajectories is wanted a grid comes first: it tells from which starts the
+    network's loop is in a wrong class. Within a deadline trajectories do: most loops are in the
+    right class, and one takes a fifth of the grid's time.
 
     Args:
         asked: starts; without any, the planner chooses its own.
         first: nodes of the first grid; 0 for no grids at all.
-        patient: whether finer grids follow exact trajectories that leave them little to gain.
+        patient: whether there is a deadline. Then finer grids follow even exact trajectories that
+            leave them little to gain.
     """
     exact = [Step(start=i) for i in range(asked or TRAJECTORIES)]
     if not first:
@@ -40,7 +44,8 @@ def steps(asked: int, first: int, patient: bool) -> tuple[Step, ...]:
     finer = (n for n in USUAL if n > max(first, FIRST))
     if asked and asked <= TRAJECTORIES and not patient:
         finer = ()
-    return (Step(nodes=first), *exact, *(Step(nodes=n) for n in finer))
+    grids = (Step(nodes=first), *(Step(nodes=n) for n in finer))
+    return (*exact, *grids) if patient else (grids[0], *exact, *grids[1:])
 
 
 @dataclass
@@ -65,13 +70,18 @@ class Clock:
             return self.pace * USUAL[step.nodes] + self.motion * motions
         return self.trajectory
 
-    def first_grid(self, asked: int, seconds: float) -> int:
+    def first_grid(self, asked: int, seconds: float, cores: int) -> int:
         """Nodes of the finest grid, up to `FIRST`, that ends well before a deadline; 0 for none.
 
-        What is left of it is for the exact trajectories that the grid asks for. One as coarse as
-        `COARSE` knows less than the networks, and would take time from exact trajectories.
+        Before it come exact trajectories from all starts asked for, and what is left after it is
+        for those that it asks for. One as coarse as `COARSE` knows less than the networks.
+
+        Args:
+            asked: starts.
+            seconds: until the deadline.
+            cores: that share the exact trajectories.
         """
-        most = GRID_PART * seconds
+        most = GRID_PART * (seconds - asked * self.trajectory / cores)
         sizes = [n for n in USUAL if COARSE < n <= FIRST]
         return max((n for n in sizes if self.expected(Step(nodes=n), asked) <= most), default=0)
 
