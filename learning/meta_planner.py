@@ -52,7 +52,7 @@ class MetaPlanner:
         grids: whether to use grids at all; without, only network and exact trajectories.
         seconds: the deadline that plans will be given, if one. Then grids follow the exact
             trajectories, ever finer as long as they end in time, and whatever is ready first is
-            used first.
+            used first. Only where a loop costs more than the network foresaw a grid is begun first.
         suspicion: a motion so many times as costly as a grid's loop from the same start is held
             to be in the wrong class, and one beside the grid's is sought; infinite for never.
         cores: that it may occupy. Without a deadline the answer does not depend on how many.
@@ -119,11 +119,17 @@ class MetaPlanner:
             raise SolveError(Status.NOT_APPLICABLE, "the network was trained on other queries")
         network = NetworkValue(encoder, chosen.weights)
         rows = np.array(starts, dtype=float).reshape(-1, query.system.n)
-        first = self._first_grid(len(rows))
+        first, doubted = FIRST if self.grids else 0, True
         grids = Ahead(partial(solved_grid, query, rows))
         if first and self.cores > 1 and self.seconds is None:
             grids = grids.begun([first], 1)
         loops = network_loops(network, rows, self.cores)
+        if self.grids and self.seconds is not None:
+            foreseen = zip(loops, network.value(rows), strict=True)
+            doubted = any(loop is None or loop.is_doubted(V) for loop, V in foreseen)
+            first = self._timely_grid(begun, len(rows), doubted)
+            if first and self.cores > 1 and doubted:
+                grids = grids.begun([first], 1)
         costs = np.array([np.inf if loop is None else loop.cost for loop in loops])
         costs = np.where(query.goal_distance(rows) > 0, costs, 0.0)
         state = MetaState(
@@ -134,7 +140,7 @@ class MetaPlanner:
             begun,
             loops,
             (Base(NetworkPolicy(network), network, costs, chosen.worth_nodes),),
-            steps(len(rows), first, self.seconds is not None),
+            steps(len(rows), first, self.seconds is not None, doubted),
             Ahead(unknown),
             grids,
             (None,) * len(rows),
@@ -167,11 +173,15 @@ class MetaPlanner:
         base = state.base.value
         return base if state.tubes is None else TubeValue(state.tubes, base)
 
-    def _first_grid(self, asked: int) -> int:
-        """Nodes of the first grid for so many starts asked for; 0 for none."""
-        if not self.grids or self.seconds is None:
-            return FIRST if self.grids else 0
-        return self.clock.first_grid(asked, self.seconds, self.cores)
+    def _timely_grid(self, begun: float, asked: int, doubted: bool) -> int:
+        """Nodes of the first grid before the deadline, for so many starts asked for; 0 for none.
+
+        Unless loops are doubted, exact trajectories come before it, shared by the cores.
+        """
+        left = begun + (self.seconds or np.inf) - time.perf_counter()
+        if not doubted:
+            left -= asked * self.clock.expected(Step(start=0)) / self.cores
+        return self.clock.first_grid(asked, left)
 
     def _look_ahead(self, state: MetaState) -> MetaState:
         """Have the other cores begin the next step or what comes after it.

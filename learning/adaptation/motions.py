@@ -24,6 +24,7 @@ MANY = 4  # starts whose loops are worth another core
 MARGIN = 0.5  # metres of the grids beyond the domain
 PRECISION = Precision(newton=1e-6, step=1e-6, check=1e-9)
 """Of the exact trajectories: costs to 1e-9, in two thirds of the time."""
+SURPRISE = 1.01  # a loop so many times as costly as foreseen; one in twenty is
 SUSPICION = 1.003  # a motion so many times as costly as a grid's loop is in the wrong class
 
 
@@ -38,6 +39,10 @@ class Loop:
 
     path: Floats
     cost: float
+
+    def is_doubted(self, value: float) -> bool:
+        """Whether it costs more than its network had said, `value`: it may be in a wrong class."""
+        return self.cost > SURPRISE * value
 
     def motion(self, query: Query) -> Trajectory:
         """The loop as a guess."""

@@ -25,18 +25,16 @@ class Step:
     nodes: int = 0
 
 
-def steps(asked: int, first: int, patient: bool) -> tuple[Step, ...]:
+def steps(asked: int, first: int, patient: bool, doubted: bool) -> tuple[Step, ...]:
     """What there is to do for so many starts asked for.
-
-    Where a number of trajectories is wanted a grid comes first: it tells from which starts the
-    network's loop is in a wrong class. Within a deadline trajectories do: most loops are in the
-    right class, and one takes a fifth of the grid's time.
 
     Args:
         asked: starts; without any, the planner chooses its own.
         first: nodes of the first grid; 0 for no grids at all.
         patient: whether there is a deadline. Then finer grids follow even exact trajectories that
             leave them little to gain.
+        doubted: whether the first grid comes before exact trajectories: it tells from which starts
+            the network's loop is in a wrong class. It takes the time of several of them.
     """
     exact = [Step(start=i) for i in range(asked or TRAJECTORIES)]
     if not first:
@@ -45,7 +43,7 @@ def steps(asked: int, first: int, patient: bool) -> tuple[Step, ...]:
     if asked and asked <= TRAJECTORIES and not patient:
         finer = ()
     grids = (Step(nodes=first), *(Step(nodes=n) for n in finer))
-    return (*exact, *grids) if patient else (grids[0], *exact, *grids[1:])
+    return (grids[0], *exact, *grids[1:]) if doubted else (*exact, *grids)
 
 
 @dataclass
@@ -70,18 +68,17 @@ class Clock:
             return self.pace * USUAL[step.nodes] + self.motion * motions
         return self.trajectory
 
-    def first_grid(self, asked: int, seconds: float, cores: int) -> int:
+    def first_grid(self, asked: int, seconds: float) -> int:
         """Nodes of the finest grid, up to `FIRST`, that ends well before a deadline; 0 for none.
 
-        Before it come exact trajectories from all starts asked for, and what is left after it is
-        for those that it asks for. One as coarse as `COARSE` knows less than the networks.
+        What is left after it is for exact trajectories that it asks for. One as coarse as `COARSE`
+        knows less than the networks.
 
         Args:
-            asked: starts.
-            seconds: until the deadline.
-            cores: that share the exact trajectories.
+            asked: starts, from which it drives its closed loops.
+            seconds: until the deadline, from when it is begun.
         """
-        most = GRID_PART * (seconds - asked * self.trajectory / cores)
+        most = GRID_PART * seconds
         sizes = [n for n in USUAL if COARSE < n <= FIRST]
         return max((n for n in sizes if self.expected(Step(nodes=n), asked) <= most), default=0)
 

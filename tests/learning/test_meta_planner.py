@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from learning import MetaPlanner
-from learning.adaptation import schedule
+from learning.adaptation import motions, schedule
 from learning.adaptation.motions import solved_grid
 from learning.adaptation.schedule import Clock, Step
 from learning.adaptation.state import DOUBT
@@ -214,17 +214,17 @@ def test_a_start_in_the_goal_needs_nothing(problem):
 
 
 def test_only_a_deadline_lets_fine_grids_follow_few_trajectories():
-    assert max(s.nodes for s in schedule.steps(4, schedule.FIRST, patient=False)) == 18_000
-    assert schedule.steps(4, schedule.FIRST, patient=True)[-1] == Step(nodes=240_000)
+    assert max(s.nodes for s in schedule.steps(4, schedule.FIRST, False, True)) == 18_000
+    assert schedule.steps(4, schedule.FIRST, True, True)[-1] == Step(nodes=240_000)
     for asked in (0, 1, 4, 5, 20):
         for patient in (False, True):
-            steps = schedule.steps(asked, schedule.FIRST, patient=patient)
+            steps = schedule.steps(asked, schedule.FIRST, patient, not patient)
             exact = [s.start for s in steps if not s.nodes]
             assert exact == list(range(asked or schedule.TRAJECTORIES))
             grids = [s.nodes for s in steps if s.nodes]
             assert grids == sorted(grids)
             assert steps[len(exact) if patient else 0] == Step(nodes=18_000)
-            alone = schedule.steps(asked, 0, patient=patient)
+            alone = schedule.steps(asked, 0, patient, not patient)
             assert [s.start for s in alone] == exact
 
 
@@ -371,20 +371,32 @@ def test_one_slow_step_does_not_end_all_others(step: Step) -> None:
 
 def test_the_first_grid_is_the_finest_that_ends_before_the_deadline() -> None:
     clock = Clock()
-    sizes = [clock.first_grid(4, seconds, 2) for seconds in np.linspace(1e-3, 0.1, 50)]
+    sizes = [clock.first_grid(4, seconds) for seconds in np.linspace(1e-3, 0.1, 50)]
     assert sizes == sorted(sizes)
     assert sizes[0] == 0
     assert sizes[-1] == schedule.FIRST
-    assert clock.first_grid(40, 0.02, 2) < clock.first_grid(1, 0.02, 2)
-    assert clock.first_grid(4, 0.018, 1) < clock.first_grid(4, 0.018, 2), "one core has less time"
+    assert clock.first_grid(40, 0.02) < clock.first_grid(1, 0.02)
+
+
+def test_within_a_deadline_a_grid_is_begun_first_only_where_a_loop_is_a_surprise(
+    problem, monkeypatch
+) -> None:
+    """Doubted is a loop that costs more than V had said at its start."""
+    name, query, starts, _ = problem
+    planner = replace(MetaPlanner.pretrained(name, seconds=60.0), cores=2)
+    for surprise, first in ((10.0, False), (0.5, True)):
+        monkeypatch.setattr(motions, "SURPRISE", surprise)
+        state = planner.start(query, starts)
+        assert bool(state.grids.under_way) == first
+        assert bool(state.pending[0].nodes) == first
 
 
 def test_what_was_too_slow_for_any_deadline_is_forgotten_in_time(problem) -> None:
     name, query, starts, _ = problem
     clock = Clock(trajectory=1.0, pace=100.0)
     planner = replace(MetaPlanner.pretrained(name, seconds=0.02), clock=clock)
-    assert clock.first_grid(1, 0.02, 2) == 0
+    assert clock.first_grid(1, 0.02) == 0
     for _ in range(400):
         planner.start(query, starts)
-    assert clock.first_grid(1, 0.02, 2) > 0
+    assert clock.first_grid(1, 0.02) > 0
     assert clock.expected(Step(start=0)) < 0.01
