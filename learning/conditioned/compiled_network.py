@@ -179,7 +179,7 @@ def _evaluate(
     S, F, M, T, K = sizes[0], sizes[1], sizes[2], sizes[3], sizes[4]
     encode = encode_at(functions[3, 0], functions[3, 1])
     count = obstacles.shape[0]
-    block = min(BLOCK, states.shape[0])
+    block = max(1, min(BLOCK, states.shape[0]))
     free = np.empty((block, 4))
     x, dx = np.empty((block, S)), np.empty((block, S, 3))
     f, df = np.empty((block, count, F)), np.empty((block, count, F, 3))

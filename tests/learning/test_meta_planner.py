@@ -289,6 +289,10 @@ def test_no_starts_mean_the_whole_space(problem):
     name, query, starts, optima = problem
     planned = MetaPlanner.pretrained(name).plan(query, until=iterations(2))
     assert aggregate_excess(planned.policy, starts, optima) < 0.05
+    within = MetaPlanner.pretrained(name, seconds=60.0).plan(query, until=iterations(2))
+    assert within.trajectories == 2
+    assert aggregate_excess(within.policy, starts, optima) < 0.05
+    assert within.value.value(np.zeros((0, 3))).shape == (0,)
 
 
 def test_a_step_is_not_begun_that_would_end_late():
