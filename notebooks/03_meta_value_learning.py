@@ -80,7 +80,7 @@ draw_plan(axes[2], query, loops, optima)
 axes[2].set_title("closed loops after adaptation; optima dashed")
 plt.show()
 assert max(medians.values()) < 0.2
-assert max(tails.values()) < 1.5
+assert max(tails.values()) < 0.8
 
 # %% [markdown]
 # ## Gradient against costate
@@ -108,4 +108,4 @@ plt.show()
 print("median difference from the costate, of its largest entry")
 for title, difference in differences.items():
     print(f"  {title:18s} {difference:.2e}")
-assert differences["after adaptation"] < 1e-3
+assert differences["after adaptation"] < min(1e-3, 0.1 * differences["network alone"])
